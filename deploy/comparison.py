@@ -50,13 +50,13 @@ class Data:
     """The data on which a network is calibrated or evaluated.
 
     Attributes:
-        sensor: of the simulated patches.
+        sensor: the sensor of the simulated patches.
         samples: the user's own, in place of patches; None for none.
         images: folder of scenes for the patches; None for drawn ones.
         patches: number of patches.
-        seed: of the patches.
+        seed: the seed of the patches.
         patch_px: side of a patch. Those of a gate have 128 pixels.
-        input_range: of the samples, as the user states it; None to find it.
+        input_range: the input range of the samples, as the user states it; None to find it.
     """
 
     sensor: Sensor
@@ -132,7 +132,7 @@ def require_in_range(ranges: Ranges, int8: Network) -> None:
     """Raise ImageError if samples are far outside the range that an INT8 network of ours reads.
 
     Args:
-        ranges: of the samples' channels; empty if all are in [0, 1].
+        ranges: the ranges of the samples' channels; empty if all are in [0, 1].
         int8: the INT8 network.
 
     Raises:
@@ -212,10 +212,10 @@ def compare(
             quantised in this process, stands for both.
         int8_network: its INT8 network.
         samples: a path, arrays or any input that `quantize` accepts; simulated patches if None.
-        sensor: of the simulated patches and of shipped networks.
+        sensor: the sensor of the simulated patches and of shipped networks.
         images: folder of scenes for the patches; drawn ones if None.
         patches: number of simulated patches, 128 x 128 pixels each.
-        seed: of the patches.
+        seed: the seed of the patches.
         metric: psnr, ssim or mae: also compare the results with the references.
         output: name of the output to compare, if a network has several.
         progress: a function that is called at each step, False for silence, None for a bar or lines

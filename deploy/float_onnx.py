@@ -182,7 +182,7 @@ def about(variant: str, weights: Weights, sensor: str | None = None) -> dict[str
 
     Args:
         variant: the name that the network is listed under.
-        weights: of the network.
+        weights: the weights of the network.
         sensor: the name of the one that it is conditioned on; that of the recipe if None.
     """
     recipe = weights.recipe

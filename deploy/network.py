@@ -71,7 +71,7 @@ class Network:
         layers: if it was quantised here, a row for each replaced operator and each integer layer.
         quantised: its integer core and the graph that it was rounded from, if it was quantised here
             by itself.
-        file_sha256: of the file as it was read; empty if it is only in memory.
+        file_sha256: the SHA-256 of the file as it was read; empty if it is only in memory.
         weights: if it is conditioned on its sensor, the weights that it was made from.
         profile: the sensor that such a network is conditioned on.
         table: the report of `quantize`.

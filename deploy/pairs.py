@@ -125,7 +125,7 @@ def simulated_pair(
         size_px: side of the images of a drawn scene.
         radiance_scale: factor of the scene's radiance.
         ratio: scene pixels for each pixel.
-        seed: of every random draw.
+        seed: the seed of every random draw.
 
     Raises:
         ImageError: the scene cannot be read, or is too small for the margin that the blur needs.

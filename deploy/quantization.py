@@ -95,7 +95,7 @@ def quantized(
         data: the data it is calibrated on.
         target: the board whose rules apply.
         finetune: steps that train the integers, or "auto".
-        effort: of the search for equalization factors.
+        effort: the effort of the search for equalization factors.
         adapts: replace operators that the DPU lacks.
         output: name of the output to retain; None for the only one.
 
@@ -145,8 +145,8 @@ def quantize_alone(
         origin: the float network.
         calibration: patches or samples.
         target: the board whose rules apply.
-        steps: of fine-tuning; None to continue while it helps, 0 for none.
-        effort: of the search for equalization factors.
+        steps: the steps of fine-tuning; None to continue while it helps, 0 for none.
+        effort: the effort of the search for equalization factors.
         adapts: replace operators that the DPU lacks. The result is compared with `origin` as it is.
 
     Returns:
@@ -198,7 +198,7 @@ def quantize_conditioned(
             each layer.
         sensor: the sensor that the result is conditioned on.
         target: the board whose rules apply.
-        effort: of the search for equalization factors.
+        effort: the effort of the search for equalization factors.
 
     Returns:
         The INT8 network for `sensor`, with statistics of each layer.
@@ -301,10 +301,10 @@ def family_model(
         network: weights that 'train --conditioned' wrote.
         images: folders of photographs, to which about the same number of drawn scenes is added. If
             empty, only drawn scenes are used.
-        seed: of the patches.
+        seed: the seed of the patches.
         shifts: the shift limits of the target.
         passes: the passes that reduce the error.
-        effort: of the search for equalization factors.
+        effort: the effort of the search for equalization factors.
     """
     # This loads SciPy, which samples of one's own do without.
     from beers_deploy.model.simulator.procedural import load_scenes

@@ -73,7 +73,7 @@ class Table:
 
     Attributes:
         command: the verb.
-        arguments: of the verb.
+        arguments: the arguments of the verb.
         inputs: files and networks that the figures rest on.
         rows: the figures, each with its value, unit, mode, interval and source.
         checks: the checks of the verb; the command exits with 1 if one of them failed.
@@ -141,7 +141,7 @@ class Table:
         """Print the tables, checks and notes.
 
         Args:
-            console: of rich; standard output if None.
+            console: the console of rich; standard output if None.
             details: if True, include tables, figures and words that are shown only in detail.
         """
         console = console or default_console()

@@ -95,9 +95,9 @@ class Baseline:
     """The figures of an earlier gate that passed.
 
     Attributes:
-        path: of its document.
+        path: the path of its document.
         mae: over full scale.
-        psnr_float_db: of the float network against the references; NaN without any.
+        psnr_float_db: the PSNR of the float network against the references; NaN without any.
         digests: SHA-256 of its inputs, by name; two networks may have one file name.
         checks: names of its checks.
     """
@@ -141,8 +141,8 @@ def read_baseline(path: Path, arguments: Mapping[str, Any]) -> Baseline:
     """Read the document of an earlier gate that passed on the same patches.
 
     Args:
-        path: of the document.
-        arguments: of the gate that is to be compared with it.
+        path: the path of the document.
+        arguments: the arguments of the gate that is to be compared with it.
 
     Raises:
         OptionError: the file is not a results document, or is one of another command, of a gate
@@ -229,9 +229,9 @@ def baseline_for(
     """Read the baseline that a gate compares with: the document of an earlier `gate --json`.
 
     Args:
-        path: of the document; None for no baseline.
-        arguments: of this gate. The baseline must have judged the same patches.
-        limits: of this gate; some need a baseline or a metric.
+        path: the path of the document; None for no baseline.
+        arguments: the arguments of this gate. The baseline must have judged the same patches.
+        limits: the limits of this gate; some need a baseline or a metric.
         metric: by which results are compared with references; None for no metric.
 
     Returns:
@@ -276,9 +276,9 @@ def judged(
     """Return the verdict on a comparison.
 
     Args:
-        comparison: of the float and the INT8 network.
+        comparison: the comparison of the float and the INT8 network.
         limits: the limits of the differences.
-        baseline: of an earlier gate, or None.
+        baseline: the baseline of an earlier gate, or None.
         target: the board whose rules apply to the INT8 file.
         own: the user's samples that both were compared on; None for simulated patches.
 

@@ -305,7 +305,7 @@ def for_sensor(
         network: a network behind a bank is conditioned on the sensor; a plain one is returned
             unchanged.
         vector: the sensor vector (4,).
-        bank: of the sensor; None builds it from the vector.
+        bank: the bank of the sensor; None builds it from the vector.
     """
     return OfOneSensor(network, vector, bank) if isinstance(network, BankedConvBEERS) else network
 

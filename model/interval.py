@@ -113,7 +113,7 @@ class PixelInterval:
         """Return the half-width of images of a sensor.
 
         Args:
-            sensor: that acquired the raw images.
+            sensor: the sensor that acquired the raw images.
             full_scale: the pixel value that is the sensor's largest digital number.
             level: the share of pixels within the interval, in percent.
 
@@ -145,7 +145,7 @@ class PixelInterval:
 
         Args:
             text: what `to_json` returned.
-            name: of the file, for the message.
+            name: the name of the file, for the message.
 
         Raises:
             ModelError: anything else.
@@ -178,9 +178,9 @@ class HalfWidth:
     """The half-width of pixels of one sensor at one level.
 
     Attributes:
-        variances: of the noise, see `model.self_check.noise_variances`.
+        variances: the variances of the noise, see `model.self_check.noise_variances`.
         offset: the pixel value of the dark.
-        exponent: of s / sigma.
+        exponent: the exponent of s / sigma.
         factor: the half-width in sigma where s is sigma.
         most: the largest half-width: no error exceeds full scale.
     """
@@ -220,7 +220,7 @@ def noise_and_detail(
     Args:
         restored: (h, w) pixel values as they are stored.
         known: see `HalfWidth.of`.
-        variances: of the noise, see `HalfWidth`.
+        variances: the variances of the noise, see `HalfWidth`.
         offset: the pixel value of the dark.
     """
     pixels = np.where(known, restored, 0).astype(np.float64)
@@ -246,7 +246,7 @@ class Sample:
     """Pixels of one restored acquisition whose truth is known.
 
     Attributes:
-        sensor: that acquired them.
+        sensor: the sensor that acquired them.
         noise: sigma of each, (n,).
         detail: s / sigma of each, (n,).
         error: the absolute error of each in the same units, (n,).
@@ -352,7 +352,7 @@ def conformal_quantile(scores: Sequence[Array], level: float) -> float:
     exceed.
 
     Args:
-        scores: of each group, (n,).
+        scores: the scores of each group, (n,).
         level: in percent.
 
     Returns:

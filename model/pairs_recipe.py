@@ -63,7 +63,7 @@ def profiles_for(
     Args:
         sensor: the named sensor; None for that of the recipe, or the default.
         reference: the named reference, likewise.
-        recipe: of the pairs; a named sensor must agree with it. None if there is none.
+        recipe: the recipe of the pairs; a named sensor must agree with it. None if there is none.
     """
     if recipe is None:
         degraded = Sensor.load(sensor or SENSOR)

@@ -113,8 +113,8 @@ class SelfCheck:
         rows: (terms, 2 REACH_PX + 1); H's kernel is the sum of the terms' products of a row and a
             column.
         columns: likewise.
-        variances: of the noise in squared pixel values: in the dark, its growth with the light, and
-            its growth with the squared light.
+        variances: the variances of the noise in squared pixel values: in the dark, its growth with
+            the light, and its growth with the squared light.
         offset: the pixel value of the dark.
         full_scale: the pixel value at and above which a raw pixel is saturated.
     """

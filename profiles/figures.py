@@ -155,11 +155,11 @@ class Check:
     NaN never passes.
 
     Attributes:
-        name: of the measured quantity, for example "MAE".
+        name: the name of the measured quantity, for example "MAE".
         value: the measured value, in `unit`; infinite or NaN if a network returned that.
         limit: the largest value that passes, or the smallest if `bound` is "at least"; infinity for
             none.
-        unit: of both; a count has the name of the counted objects, for example "node".
+        unit: the unit of both; a count has the name of the counted objects, for example "node".
         bound: the side of the limit that passes.
         detail: where the value was measured, or where the limit comes from; may be empty.
     """

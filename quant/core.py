@@ -200,7 +200,7 @@ def build_core(
         graph: a plane-reading graph.
         frac_bits: the least-squares number of fractional bits of every activation.
         shifts: the windows of the target.
-        host_part: of the core.
+        host_part: the host part of the core.
         earlier: convolutions of earlier calls, which are not rounded again; new ones are added.
     """
     earlier = {} if earlier is None else earlier

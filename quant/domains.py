@@ -69,8 +69,9 @@ def operator_name(node: NodeProto, functions: Functions = ()) -> str:
     integers.
 
     Args:
-        node: of a file.
-        functions: that the file defines; one may have the name of an operator of ONNX.
+        node: the node of a file.
+        functions: the functions that the file defines; one may have the name of an operator of
+            ONNX.
     """
     if (node.domain, node.op_type) in functions:
         return f"{node.domain}{SEPARATOR}{node.op_type}"

@@ -34,7 +34,7 @@ class Metric:
     """A metric by which a user judges results.
 
     Attributes:
-        unit: of the figure.
+        unit: the unit of the figure.
         larger_is_better: whether a larger value is better.
         value: function of a result (1, C, H, W) and its reference of the same shape.
     """
@@ -199,7 +199,7 @@ def compare(
     Args:
         float_session: the float network's.
         int8_session: the INT8 network's.
-        patches: that both are run on.
+        patches: the patches that both are run on.
         metric: one of `METRICS`, by which results are also compared with the references.
 
     Raises:
@@ -316,8 +316,8 @@ def unfit_reference(patches: Patches, number: int, purpose: str) -> ImageError:
 
     Args:
         patches: the samples.
-        number: of the sample.
-        purpose: that needs the reference, for the message.
+        number: the number of the sample.
+        purpose: the purpose that needs the reference, for the message.
     """
     shape = patches.pairs[number][1].shape
     fault = f"its reference has {times(shape[1:])}" if math.prod(shape) else "it has none"
@@ -373,7 +373,7 @@ def figure_of(value: float, unit: str, source: str, missing: str) -> Figure:
 
     Args:
         value: in the unit.
-        unit: of the figure.
+        unit: the unit of the figure.
         source: how it was measured.
         missing: why it is NaN.
     """

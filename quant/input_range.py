@@ -126,9 +126,9 @@ def ranges_of_result(result: np.ndarray, image: np.ndarray, ranges: Ranges) -> R
     3. Any other result has the ranges of the image's channels.
 
     Args:
-        result: of the float network, (1, C', H', W').
+        result: the result of the float network, (1, C', H', W').
         image: (1, C, H, W) from which it was computed.
-        ranges: of the image's channels; empty where all are [0, 1].
+        ranges: the ranges of the image's channels; empty where all are [0, 1].
     """
     if share_within(result, *AROUND_UNIT) >= NEARLY_ALL:
         return ranges if share_within(image, *AROUND_UNIT) >= NEARLY_ALL else ()
@@ -150,7 +150,7 @@ def to_shares(values: np.ndarray, ranges: Ranges) -> np.ndarray:
 
     Args:
         values: images or results (..., C, H, W) in the network's units.
-        ranges: of the image's channels; empty returns `values` itself.
+        ranges: the ranges of the image's channels; empty returns `values` itself.
     """
     if not ranges:
         return values
@@ -163,7 +163,7 @@ def from_shares(shares: np.ndarray, ranges: Ranges) -> np.ndarray:
 
     Args:
         shares: images or results (..., C, H, W), where 0 is low and 1 is high.
-        ranges: of the image's channels; empty returns `shares` itself.
+        ranges: the ranges of the image's channels; empty returns `shares` itself.
     """
     if not ranges:
         return shares
@@ -176,7 +176,7 @@ def _ends(values: np.ndarray, ranges: Ranges) -> np.ndarray:
 
     Args:
         values: images or results (..., C, H, W).
-        ranges: of the image's channels, at least one.
+        ranges: the ranges of the image's channels, at least one.
     """
     channels = values.shape[-3]
     # A result has the ranges of the image's first channels, because a map of noise levels comes

@@ -134,7 +134,7 @@ def _move_relu_down(largest: dict[str, int], graph: OnnxGraph, node: Node) -> li
 
     Args:
         largest: receives the largest value that the tensor can store.
-        graph: that the node belongs to.
+        graph: the graph that the node belongs to.
         node: any node.
     """
     middle = graph.value(node, 1) if node.op_type == "Max" and len(node.inputs) == 2 else None
@@ -176,7 +176,7 @@ def _add_exactly(largest: dict[str, int], graph: OnnxGraph, node: Node) -> list[
 
     Args:
         largest: the largest value that a tensor can store, if it is not that of uint8.
-        graph: that the node belongs to; its constants are extended.
+        graph: the graph that the node belongs to; its constants are extended.
         node: any node.
     """
     if node.op_type in FLOAT_OPERATORS:

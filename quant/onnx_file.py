@@ -96,7 +96,8 @@ def parse_onnx(
         content: the bytes of the file.
         where: name of the network for messages.
         to_run: whether a runtime will open it.
-        path: of the file, next to which weights may be stored; None if all are in `content`.
+        path: the path of the file, next to which weights may be stored; None if all are in
+            `content`.
     """
     if not content:
         raise ModelError(f"{where} is an empty file. {REMEDY}")
@@ -191,9 +192,9 @@ class GraphWriter:
             kind: the operator.
             output: name of the result.
             inputs: names of its inputs.
-            name: of the node; that of the result if empty.
-            domain: of the operator; None for the domain of the writer.
-            attributes: of the node.
+            name: the name of the node; that of the result if empty.
+            domain: the domain of the operator; None for the domain of the writer.
+            attributes: the attributes of the node.
         """
         node = onnx.helper.make_node(
             kind, inputs, [output], name=name or output, domain=domain or self.domain

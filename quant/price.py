@@ -108,7 +108,7 @@ class Measured:
     """Samples that steps are measured on.
 
     Attributes:
-        pairs: of an image and its reference, which may be empty.
+        pairs: the pairs of an image and its reference, which may be empty.
         floats: results of the float network.
         ranges: the smallest and the largest value of each of its tensors, and 0.
         host_part: the host's part.

@@ -119,7 +119,7 @@ class Plan:
         singles: tensors that are equalized in addition to the groups, or without groups.
         shifts: the windows of the target.
         passes: the passes that reduce the error.
-        effort: of the search for equalization factors.
+        effort: the effort of the search for equalization factors.
     """
 
     graph: Graph
@@ -185,7 +185,7 @@ def quantize_model(
         shifts: the ranges of shifts that the target allows.
         tuning: the parameters of fine-tuning; None does not train the integers.
         passes: the passes that reduce the error.
-        effort: of the search for equalization factors.
+        effort: the effort of the search for equalization factors.
 
     Returns:
         The quantised network: integer core, file for the host, and the float graph it was rounded

@@ -97,7 +97,7 @@ class LayerError:
     """The error of one layer in int8, with all others in float.
 
     Attributes:
-        name: of the layer.
+        name: the name of the layer.
         alone: in its own result; SQNR against that result.
         network: in the restored image, of full scale; SQNR against the network's correction.
     """
@@ -277,7 +277,7 @@ def losses(
         result: the network.
         gate: the differences on the patches.
         patches: held out from calibration.
-        layers: of `layer_error_rows`, if they were computed before.
+        layers: the layers of `layer_error_rows`, if they were computed before.
     """
     if math.isnan(gate.drop_db):
         mae = f"{gate.mae:.2g} of full scale on average"

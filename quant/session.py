@@ -126,7 +126,7 @@ def require_finite(values: Iterable[np.ndarray], name: str) -> None:
 
     Args:
         values: its results.
-        name: of the network, with which the message begins.
+        name: the name of the network, with which the message begins.
     """
     # NaN and infinity reach the minimum or the maximum, which need no array of their own.
     if not all(np.isfinite((value.min(), value.max())).all() for value in values):

@@ -44,7 +44,7 @@ class Rounded:
     """A tensor quantised to 8 bits.
 
     Attributes:
-        name: of the tensor.
+        name: the name of the tensor.
         scale: its scale, zero point and integer type.
         low_is_relu: True if a ReLU reads the tensor, so that values clipped at the lower end would
             have become zero anyway.
@@ -139,7 +139,7 @@ def _rounded(graph: OnnxGraph, core: IntCore | None) -> list[Rounded]:
     """Return the tensors that nodes round to 8 bits, without constants.
 
     Args:
-        graph: of the INT8 network.
+        graph: the graph of the INT8 network.
         core: its integer core, which knows copies of the result; None if the file describes none.
     """
     host_part = core.host_part if core else ONE_CHANNEL
@@ -257,7 +257,7 @@ def _is_relu(node: Node, graph: OnnxGraph, tensors: dict[str, Rounded]) -> bool:
 
     Args:
         node: any node.
-        graph: that it belongs to.
+        graph: the graph that it belongs to.
         tensors: the tensors of 8 bits by name, whose zero is their zero point.
     """
     constants = [graph.constants[name] for name in node.inputs if name in graph.constants]

@@ -91,7 +91,7 @@ def check_size(name: str, sizes: Iterable[float], where: str) -> None:
     """Raise ModelError if a file states an absurd size of a tensor.
 
     Args:
-        name: of the tensor, for the message.
+        name: the name of the tensor, for the message.
         sizes: its sizes; 0 and -1 are open sizes.
         where: name of the network, for the message.
     """

@@ -59,8 +59,8 @@ class Dpu:
 
     Attributes:
         target: the board.
-        name: of the configuration.
-        constants: of the configuration.
+        name: the name of the configuration.
+        constants: the constants of the configuration.
         runs: measured on the owner's board, with ln(given / predicted); none of a shipped one.
     """
 

@@ -78,10 +78,10 @@ def out_shape(
     Args:
         node: the node.
         kind: its kind of operation.
-        shapes: of the tensors that it reads.
-        kernel: of a convolution or pool.
+        shapes: the shapes of the tensors that it reads.
+        kernel: the kernel of a convolution or pool.
         window: strides, pads and dilations of the kernel.
-        channels: of a convolution's result.
+        channels: the channels of a convolution's result.
         constants: the file's, for operators that read sizes from them.
     """
     inputs = [shape for shape in shapes if shape is not None]

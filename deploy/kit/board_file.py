@@ -36,7 +36,7 @@ def save_core(core: Network, path: Path, target: TargetProfile) -> None:
 
     Args:
         core: the network without its host part.
-        path: of the ONNX file.
+        path: the path of the ONNX file.
         target: the board.
     """
     core.save(path)

@@ -114,7 +114,7 @@ class Question:
         tiles_px: tile sides.
         halo: "exact" or a number of pixels.
         within_s: the time limit of the swath; None for no limit.
-        task: of the host; None derives it from the file.
+        task: the task of the host; None derives it from the file.
         consistency: True if the host computes the consistency step.
     """
 

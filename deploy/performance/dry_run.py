@@ -43,7 +43,7 @@ def preview_row(
 
     Args:
         image: its file.
-        pipeline: that would restore it.
+        pipeline: the pipeline that would restore it.
         reading: how its pixels would be understood.
         target: the board whose time is predicted.
     """

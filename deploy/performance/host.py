@@ -47,7 +47,7 @@ def time_networks(
     Args:
         runs: the networks; they receive times, powers and memory.
         tile_px: side of the tile.
-        threads: of the runtime.
+        threads: the threads of the runtime.
         min_time_s: the shortest total time of a network's runs.
         min_runs: the smallest number of them.
     """

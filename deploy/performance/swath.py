@@ -33,8 +33,8 @@ class Swath:
     """The image that all rows describe, and the tiles it is cut into.
 
     Attributes:
-        width_px: of the image.
-        height_px: of the image.
+        width_px: the width of the image.
+        height_px: the height of the image.
         tile_px: side of a tile.
         halo_px: context around the part of a tile that is stored.
         runs: mean number of runs of the network on a tile, one for each exposure that its pixels
@@ -115,7 +115,7 @@ def swath_figures(
     """Return the figures of a swath: latency, throughput, power, energy and others.
 
     Args:
-        prediction: of the network for one tile size.
+        prediction: the prediction of the network for one tile size.
         swath: the image and its tiles.
         frames: number of tiles, which may be a fraction.
         batches: number of batches for them.
@@ -164,7 +164,7 @@ def host_time(prediction: Prediction, unit: str) -> Figure:
     """Return the time in ms that all cores of the host need for an image.
 
     Args:
-        prediction: of the network.
+        prediction: the prediction of the network.
         unit: the unit that the figure states.
     """
     low_s, high_s = prediction.host_interval_s

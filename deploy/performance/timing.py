@@ -102,7 +102,7 @@ def load_of_others(load: Figure, own_s: float, elapsed_s: float) -> float:
     """Return the share of all CPUs that other processes took.
 
     Args:
-        load: of all CPUs over a window.
+        load: the load of all CPUs over a window.
         own_s: CPU time of this process over it.
         elapsed_s: length of the window.
     """

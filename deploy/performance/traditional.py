@@ -31,7 +31,7 @@ class PipelineTime:
 
     Attributes:
         s_per_mpx: time in s for 10^6 pixels, of each crop.
-        power: of this processor while it ran.
+        power: the power of this processor while it ran.
         conditions: threads and CPU load.
         crop: size of the crops, for the source of the figures.
     """

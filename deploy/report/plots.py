@@ -255,8 +255,8 @@ def curves_svg(
 
     Args:
         panels: curves that share axes, under a title.
-        x_title: of the x axis.
-        y_title: of the y axis.
+        x_title: the title of the x axis.
+        y_title: the title of the y axis.
         logarithmic: if True, the x axis is logarithmic and each point has a dot; else only lines
             are drawn.
 

@@ -41,8 +41,8 @@ def sensitivity_page(
 
     Args:
         headline: the result, in one or two sentences.
-        rows: of all tables, in reading order.
-        spread: of the errors on the patches.
+        rows: the rows of all tables, in reading order.
+        spread: the spread of the errors on the patches.
         patches: samples that neither network was calibrated on.
         sessions: the float and the INT8 network.
         worst: the numbers of the patches to show.

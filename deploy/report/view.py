@@ -31,7 +31,7 @@ def write_view(
     """Write the view of a run, atomically.
 
     Args:
-        path: of the HTML file.
+        path: the path of the HTML file.
         image: the raw image.
         restored: the image that was made from it.
         maps: further layers; see `layers_of`.

@@ -123,7 +123,7 @@ def read_planes(source: Source, bands: Sequence[int], factor: int) -> Planes:
     Args:
         source: an open image.
         bands: their numbers, from 0.
-        factor: of the reduction.
+        factor: the factor of the reduction.
 
     Returns:
         (bands, H, W); NaN where a block has no known pixel.

@@ -41,7 +41,7 @@ def restore_array(
             attributes.
         reading: how its pixels are interpreted.
         load: returns the pipeline that restores it.
-        level: of the interval whose half-widths are returned too; None for none.
+        level: the level of the interval whose half-widths are returned too; None for none.
     """
     # Arrays of xarray and torch are recognised by their attributes, so that neither is imported.
     if hasattr(image, "coords") and hasattr(image, "dims"):

@@ -38,7 +38,7 @@ class FinishedRow:
 
     Attributes:
         rows_px: rows of pixels, the same for each band.
-        size_bytes: of the pixels of all bands.
+        size_bytes: the size of the pixels of all bands.
         sha256: hex digest of these bytes, band after band.
         tally: the statistics of these pixels.
     """
@@ -103,7 +103,7 @@ class Checkpoint:
         Args:
             out: the image to write in the end.
             shape: (bands, height, width).
-            dtype: of the pixels.
+            dtype: the dtype of the pixels.
             job: all parameters that determine the pixels; a run is resumed only by one of the same
                 job.
             resume: continue an earlier run; start if there is none.

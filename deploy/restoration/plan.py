@@ -74,7 +74,7 @@ def plan_side(
     the side is shorter.
 
     Args:
-        size_px: of the image.
+        size_px: the size of the image.
         tile_px: side of a tile; rounded down to the lattice.
         halo_px: a multiple of the lattice.
         alignment_px: spans begin and end at multiples of this.
@@ -123,15 +123,15 @@ class Plan:
     """Rows and columns of tiles over an image of `bands` bands.
 
     Attributes:
-        bands: of the image. Each is cut in the same way and restored separately, or jointly if the
-            network reads several.
-        height_px: of the image.
-        width_px: of the image.
+        bands: the bands of the image. Each is cut in the same way and restored separately, or
+            jointly if the network reads several.
+        height_px: the height of the image.
+        width_px: the width of the image.
         tile_px: the longest side of a tile.
         halo_px: context around the retained part of a tile.
         tiling: the network's tiling geometry.
-        rows: of tiles, from top to bottom.
-        columns: of tiles, from left to right.
+        rows: the rows of tiles, from top to bottom.
+        columns: the columns of tiles, from left to right.
     """
 
     bands: int

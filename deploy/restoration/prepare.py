@@ -61,13 +61,13 @@ class Restoration(ABC):
 
     Attributes:
         source: the image.
-        name: of the image, for messages.
+        name: the name of the image, for messages.
         reading: how its pixels are interpreted.
         networks: the networks that restore its bands; empty for the traditional pipeline.
         scale: the pixel value that is full scale.
         check: the result of checking the image's sensor.
         check_s: the seconds that the check took.
-        out_shape: of the restored image, (bands, H, W).
+        out_shape: the shape of the restored image, (bands, H, W).
         row_ends: the row of the restored image at which each row of tiles ends, where a later run
             can continue; empty if it cannot.
         identity: all parameters that determine the pixels, besides the image and the full scale.
@@ -134,7 +134,7 @@ class Pipeline(Protocol):
         Args:
             source: the image.
             reading: how its pixels are interpreted.
-            name: of the image, for messages.
+            name: the name of the image, for messages.
             cluster: the cluster whose workers run the network; None runs it here.
         """
 

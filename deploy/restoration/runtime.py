@@ -37,8 +37,8 @@ class Engine:
 
     Attributes:
         runtime: the library.
-        threads: of the runtime; 0 uses every core, or one for each call that a scheduler's workers
-            run at once.
+        threads: the threads of the runtime; 0 uses every core, or one for each call that a
+            scheduler's workers run at once.
         scheduler: address of a Dask scheduler whose workers run the network; None runs it here.
     """
 
@@ -212,7 +212,7 @@ class Packed:
     Attributes:
         content: bytes of its ONNX file.
         runtime: the library that runs it.
-        threads: of the runtime.
+        threads: the threads of the runtime.
     """
 
     content: bytes

@@ -104,7 +104,7 @@ class BlockMap:
         """Raise ImageError if the result contradicts its raw image.
 
         Args:
-            name: of the image, for the message.
+            name: the name of the image, for the message.
         """
         if self.doubt:
             raise ImageError(f"The restoration of {name} {self.doubt}")

@@ -68,8 +68,8 @@ def write_item(run: Run, path: Path, maps: Mapping[str, Path]) -> None:
     An image without a transform and a coordinate system has no geometry in its item.
 
     Args:
-        run: that wrote the image.
-        path: of the item; the items of its networks are written next to it.
+        run: the run that wrote the image.
+        path: the path of the item; the items of its networks are written next to it.
         maps: further rasters over the same place, by name: they become assets.
     """
     pystac: Any = import_module("pystac")
@@ -177,7 +177,7 @@ def write_network_item(network: Network, path: Path, when: datetime) -> None:
 
     Args:
         network: a network of a run.
-        path: of the item.
+        path: the path of the item.
         when: the time of the run: STAC has no item without one.
     """
     pystac: Any = import_module("pystac")

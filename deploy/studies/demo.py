@@ -96,7 +96,7 @@ def read_input(
     Args:
         image: a photograph as a scene (8 bits) or a raw acquisition (mono, up to 12 bits); a
             synthetic scene if None.
-        seed: of every random draw.
+        seed: the seed of every random draw.
         sensors: the sensors that acquire a scene.
         full_scale: pixel value that is full scale. If it is given, any image is a raw acquisition.
     """

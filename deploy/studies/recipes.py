@@ -47,8 +47,8 @@ def make_network(
     """Run a recipe to its end.
 
     Args:
-        name: of the network, for its files and its model card.
-        recipe: of the network.
+        name: the name of the network, for its files and its model card.
+        recipe: the recipe of the network.
         toml: its text, for the model card.
         images: folders of photographs.
         out: the output folder.

@@ -16,7 +16,7 @@ class Column:
     """One figure of all rows.
 
     Attributes:
-        name: of the figure.
+        name: the name of the figure.
         unit: the unit that its figures share; empty if they differ.
         mode: likewise, of those that have a value.
     """

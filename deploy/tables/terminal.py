@@ -49,8 +49,8 @@ def print_rows(title: str, rows: Iterable[Row], console: Console) -> None:
     """Print the rows of one table, and below it the reasons why figures are missing.
 
     Args:
-        title: of the table.
-        rows: of the table.
+        title: the title of the table.
+        rows: the rows of the table.
         console: to print on.
     """
     table_rows = list(rows)

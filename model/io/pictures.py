@@ -116,7 +116,7 @@ def grid(names: list[str], rows: list[list[np.ndarray]], zoom: int) -> Image.Ima
     """Draw rows of equally large uint8 cells, with a name above each column.
 
     Args:
-        names: of the columns.
+        names: the names of the columns.
         rows: cells (h, w), or all of them (h, w, 3).
         zoom: width of a cell's pixel in the picture.
     """

@@ -36,7 +36,7 @@ class Pattern:
         name: one of `PATTERNS`.
         difference: between its two kinds of pixels over the level, root mean square of the sections
             without noise.
-        largest: of the sections, the largest significant one.
+        largest: the largest significant one of the sections.
         significant: whether enough sections show it significantly.
     """
 
@@ -90,7 +90,7 @@ def judge_phases(
     """Evaluate the measurements of an image's sections for each pattern.
 
     Args:
-        measured: of each section, as `measure_phases` returns it.
+        measured: the measurement of each section, as `measure_phases` returns it.
         least: the smallest relevant difference, over the level.
     """
     if not measured:

@@ -63,7 +63,7 @@ class Line:
     """A single line that is off.
 
     Attributes:
-        index: of the line.
+        index: the index of the line.
         gain: its deviation from its neighbours over the level around.
         error: standard error of that.
     """
@@ -104,7 +104,7 @@ def judge_lines(blocks: Blocks, least: float) -> Stripes:
     """Evaluate lines that were measured in blocks.
 
     Args:
-        blocks: of all lines.
+        blocks: the blocks of all lines.
         least: the smallest relevant gain, over the level.
     """
     measurable = np.isfinite(blocks.second) & np.isfinite(blocks.level)

@@ -88,7 +88,7 @@ def plain_squares(
 
     Args:
         image: (H, W), finite values; transpose it for near-horizontal edges.
-        noise: of the pixels.
+        noise: the noise of the pixels.
         clipped_at: values from here on are clipped, and so are those from 0 down.
         effort: how much is tried.
         roughness: largest scatter of a square's outer columns beyond noise, of the step.

@@ -51,7 +51,8 @@ class EdgeBlur:
     """The blur across one edge.
 
     Attributes:
-        gamma: of MTF(f) = exp(-gamma f) sinc(f), f in cycles per pixel along the edge's normal.
+        gamma: the gamma of MTF(f) = exp(-gamma f) sinc(f), f in cycles per pixel along the edge's
+            normal.
         error: standard error of gamma.
         slope: pixels by which the edge leans each line; 0 runs along the grid.
         place: column in which it crosses the middle line, from the middle of the pixels.
@@ -272,7 +273,7 @@ def _solve(
         y: (P,) their rows.
         values: (N, P) pixels.
         mask: (N, P) which of them count.
-        shape: of the curve.
+        shape: the shape of the curve.
     """
     lean = np.sqrt(1 + lines.slope**2)[:, None]
     distance = (x - lines.place[:, None] - lines.slope[:, None] * y) / lean

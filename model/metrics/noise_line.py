@@ -128,7 +128,7 @@ def fit_noise(blocks: Blocks, incomplete: bool = False) -> NoiseModel | Refusal:
     The draws of the interval are always the same.
 
     Args:
-        blocks: of all images.
+        blocks: the blocks of all images.
         incomplete: whether to accept noise that is not white, and noise at only one level of light.
     """
     if blocks.mean.size < LEAST:

@@ -92,8 +92,8 @@ class FittedEdge:
     """An edge whose line and planes are known for one curve.
 
     Attributes:
-        pixels: of the edge.
-        line: of the edge.
+        pixels: the pixels of the edge.
+        line: the line of the edge.
         levels: (6,) left and right plane: in the middle, change over half the length, change over
             HALF_PX.
         weights: (P,) one over the standard deviation of each pixel near the edge, including texture
@@ -128,7 +128,7 @@ def fit_edge(
         pixels: around the edge.
         line: where it runs roughly, within a pixel or two.
         weights: (PARTS,) of the curve.
-        passes: of Gauss-Newton.
+        passes: the passes of Gauss-Newton.
 
     Returns:
         The edge, or None where it leaves its pixels or has no step.

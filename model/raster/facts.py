@@ -124,7 +124,7 @@ class Raster:
         bands: planes of light; alpha is none of them.
         height_px: rows.
         width_px: columns.
-        dtype: of the pixels.
+        dtype: the dtype of the pixels.
         nodata: the value of missing pixels; None without one.
         bits: bits of a pixel that the sensor fills, where the file states them.
         mask_kind: what marks missing pixels besides NaN and `nodata`.
@@ -239,9 +239,9 @@ def require_small_offset(name: str, offset: float, scale: float) -> None:
     """Raise ImageError if no light is far from pixel value 0, by value = scale x pixel + offset.
 
     Args:
-        name: of the image, for the message.
-        offset: of the pixels.
-        scale: of the pixels.
+        name: the name of the image, for the message.
+        offset: the offset of the pixels.
+        scale: the scale of the pixels.
     """
     if abs(offset) > OFFSET_DN * abs(scale):
         dark = -offset / (scale or 1)

@@ -33,9 +33,10 @@ def settled_scale(
     """Determine the pixel value that is full scale, or raise ImageError if it is ambiguous.
 
     Args:
-        name: of the image, for the message.
-        dtype: of the pixels.
-        extents: of each part of the image; read for floats only, up to the first part that decides.
+        name: the name of the image, for the message.
+        dtype: the dtype of the pixels.
+        extents: the extents of each part of the image; read for floats only, up to the first part
+            that decides.
         asked: the value that the user gave; None lets type and values decide.
         usual: the full scale of digital numbers.
         remedy: a sentence on what to do if it is ambiguous and the caller has no `full_scale`.

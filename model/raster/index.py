@@ -62,7 +62,7 @@ def read_xml(path: Path, limit_bytes: int, kind: str, advice: str) -> ET.Element
     """Read a file of untrusted XML, of at most `limit_bytes`, and return its root.
 
     Args:
-        path: of the file.
+        path: the path of the file.
         limit_bytes: a larger file is rejected.
         kind: the expected kind of file, for the message.
         advice: a sentence on what to do if it is not of that kind.
@@ -91,7 +91,7 @@ def index_files(path: Path, trusted: bool = False) -> tuple[Path, ...]:
     The result is empty for a file that is no index.
 
     Args:
-        path: of any image.
+        path: the path of any image.
         trusted: whether tiles may lie outside the index's folder; URLs are then not checked.
     """
     if not is_index(path):

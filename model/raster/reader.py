@@ -222,7 +222,7 @@ class GdalSource:
         dataset: rasterio's object.
         raster: the facts.
         block_px: rows of the blocks in which it is decoded.
-        options: of GDAL.
+        options: the options of GDAL.
     """
 
     files: tuple[Path, ...]

@@ -72,10 +72,10 @@ def write_raster(
     """Write a TIFF in tiles of 256 pixels, read it again, and compare.
 
     Args:
-        path: of the TIFF; its folder exists.
+        path: the path of the TIFF; its folder exists.
         raster: the properties that the file states.
         pixels: the rows to write.
-        compression: of the tiles.
+        compression: the compression of the tiles.
         software: the program that the file names.
 
     Raises:
@@ -97,7 +97,7 @@ def require_equal(path: Path, raster: Raster, pixels: Pixels) -> None:
     """Read a written TIFF again, and raise OSError if its pixels differ from those in memory.
 
     Args:
-        path: of the TIFF.
+        path: the path of the TIFF.
         raster: the facts by which it was written; they tell which pixels the mask or alpha leaves
             out.
         pixels: the bands that were written.
@@ -214,7 +214,7 @@ def write_cog(plain: Path, cog: Path, compression: Compression, about: Mapping[s
     Args:
         plain: the TIFF; `about` is added to its metadata.
         cog: the file to write.
-        compression: of the tiles.
+        compression: the compression of the tiles.
         about: metadata items on the processing of the image.
     """
     options: dict[str, Any] = {

@@ -93,7 +93,7 @@ def behind(name: str, change_dn: float, sensor: Instrument) -> float:
     sqrt(b)| <= min(sqrt|a - b|, |a - b| / (2 sqrt(beta))).
 
     Args:
-        name: of the effect.
+        name: the name of the effect.
         change_dn: the largest change by the effect itself.
         sensor: the instrument.
 
@@ -180,7 +180,7 @@ def make_plan(sensor: Instrument, stats: SceneStats, tolerance_dn: float = TOLER
 
     Args:
         sensor: the instrument.
-        stats: of the scene.
+        stats: the statistics of the scene.
         tolerance_dn: the largest change by all effects that are skipped as negligible.
     """
     bounds = effect_bounds(sensor, stats)

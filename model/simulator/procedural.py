@@ -280,9 +280,9 @@ def load_scenes(
     """Load the scenes of a folder of images, or draw scenes if there is no folder.
 
     Args:
-        folder: of images; None draws scenes, different ones for every seed.
-        sensor: whose full scale is white in a photograph.
-        seed: of drawn scenes.
+        folder: the folder of images; None draws scenes, different ones for every seed.
+        sensor: the sensor whose full scale is white in a photograph.
+        seed: the seed of drawn scenes.
         most: the maximum number of drawn scenes.
     """
     if folder is not None:

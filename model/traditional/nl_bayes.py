@@ -137,7 +137,7 @@ def denoise_pass(
         guide: rows of the image in which similar patches are searched.
         height: the number of rows.
         noise: the noise to remove.
-        settings: of the pass.
+        settings: the settings of the pass.
         stride_px: distance of neighbouring references.
     """
     margin = settings.margin_px
@@ -249,7 +249,7 @@ def similar_groups(
         guide: (h, w), in which similar patches are searched.
         valid: (h, w) bool, False where a pixel is missing.
         places: rows and columns of the search windows.
-        settings: of the pass.
+        settings: the settings of the pass.
 
     Yields:
         The patch numbers (B, N) of groups, and a mask of those that count (None: all).
@@ -315,7 +315,7 @@ def nl_bayes_strips(
     strips are cut. Some 150 rows, and the tallest strip, are held in memory.
 
     Args:
-        strips: of the image.
+        strips: the strips of the image.
         height: the number of rows of all strips.
         noise: to remove.
         quality: density of the references and size of the groups.

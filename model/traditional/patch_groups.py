@@ -122,7 +122,7 @@ def estimate_groups(
         guide: the same patches of the guide image; in pass 1 `noisy` itself.
         mask: (B, N) of 0 and 1: which patches belong to the group, None for all; estimates of the
             others are meaningless.
-        noise: that of `noisy`.
+        noise: the noise of `noisy`.
         settings: those of the pass.
     """
     mean, centred, covariance = _moments(noisy, mask)

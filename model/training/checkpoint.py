@@ -35,7 +35,7 @@ class TrainingRecipe:
             that a far larger one is a burst.
         ema_decay: decay of the running average of the weights, which is shipped.
         loss: weights of the loss's terms.
-        seed: of the first weights and of the patches.
+        seed: the seed of the first weights and of the patches.
         rounding: the digest of the INT8 file whose rounding is applied to the maps; "" for no
             rounding.
     """
@@ -134,7 +134,7 @@ def require_finite_output(
 
     Args:
         network: on the CPU; a conditioned one is given the middle of every range.
-        name: of the network, in the message.
+        name: the name of the network, in the message.
         remedy: the last sentence of the message.
     """
     side_px = network.variant.scale * TEST_PLACES

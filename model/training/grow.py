@@ -25,7 +25,7 @@ def grow(network: N, variant: Variant, generator: torch.Generator) -> N:
     Args:
         network: the smaller network.
         variant: the size of the new one.
-        generator: of the shares by which weights are divided.
+        generator: the generator of the shares by which weights are divided.
     """
     sources = _sources(network.variant, variant)
     large = type(network)(variant)

@@ -55,7 +55,7 @@ class Pass:
         oversampling: scene pixels per target pixel.
         phase_px: shift (down, right) of the sampling grid in scene pixels; the same for both,
             because a restoration must not shift the image.
-        look: of the ground.
+        look: the look of the ground.
         margin_px: target pixels cropped on each side.
     """
 
@@ -210,7 +210,7 @@ def detected(
         signal: radiance in W/m2/sr/um.
         sensor: the instrument.
         role: "degraded" or "reference", so that the two draws of a pair differ.
-        generator: of the seed of the noise.
+        generator: the generator of the seed of the noise.
     """
     seed = int(generator.integers(2**31))
     if any(pixel_effects(sensor.effects, acts_on) for acts_on in ("radiance", "DN")):

@@ -25,7 +25,7 @@ class PatchRecipe:
             `degraded`.
         patch_px: side of a patch.
         oversamplings: ratios to draw from; each shows the same ground at another scale.
-        looks: of the ground.
+        looks: how light, contrast and softness of the ground are drawn.
         margin_px: target pixels cropped on each side.
         family: the sensors to draw from instead of `degraded`. Each patch then comes with the
             description of its sensor, and dark patches are brightened as in a restoration.
@@ -63,7 +63,7 @@ def draw_turn(
     two axes differ, they must not be swapped: four symmetries remain.
 
     Args:
-        generator: of the draws.
+        generator: the generator of the draws.
         quarters: whether odd quarter turns are allowed.
         mirrors: False if the blur is asymmetric; patches are then not changed at all.
     """

@@ -27,13 +27,13 @@ class Stage:
     """A part of a training with one learning rate schedule.
 
     Attributes:
-        name: of its folder.
+        name: the name of its folder.
         steps: the number of gradient steps.
         batch: patches per step.
         learning_rate: the highest; a cosine leads it down to 0.
         rounding: whether maps are rounded as in the INT8 file of the weights that the stage begins
             with.
-        precision: of the blocks, float32 or bfloat16.
+        precision: the precision of the blocks, float32 or bfloat16.
         average: decay per step of the running average of the weights, which is stored.
     """
 
@@ -55,14 +55,14 @@ class NetworkRecipe:
         variant: its size.
         stages: in order; each begins with the weights of the one before.
         start: shipped network whose weights, grown, the first stage begins with; "" draws weights.
-        seed: of weights, charts and patches; each stage adds its number.
+        seed: the seed of weights, charts and patches; each stage adds its number.
         patch_px: side of a patch.
         charts: the number of drawn charts in addition to the images.
         held_out: sites that are not trained on, and by which a network is selected.
         other_curves: share of sensors with an MTF of another curve than the formula's.
-        looks: of the ground.
+        looks: how light, contrast and softness of the ground are drawn.
         loss: weights of its terms.
-        attribution: of the images.
+        attribution: the attribution of the images.
         notes: sentences for the model card.
     """
 

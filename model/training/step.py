@@ -106,9 +106,9 @@ class Step:
         """Take a step.
 
         Args:
-            batch: of patches.
+            batch: the batch of patches.
             rate: learning rate.
-            share: of the new weights in their running average.
+            share: the share of the new weights in their running average.
 
         Returns:
             (2 + T,) 1 for a step that changed nothing, the loss, and its terms in the order of

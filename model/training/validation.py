@@ -42,7 +42,7 @@ def split_by_site(
     """Split images into those to train on and those held out, by whole sites and always equally.
 
     Args:
-        names: of the images.
+        names: the names of the images.
         excluded: sites to hold out. Without any, those with the fewest images are held out; with
             fewer than three sites none is.
 

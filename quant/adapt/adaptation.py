@@ -104,7 +104,7 @@ def adapt(model: onnx.ModelProto, samples: Patches, held_out: Patches) -> Adapte
 
     Args:
         model: a simplified float network.
-        samples: that convolutions are fitted on.
+        samples: the samples that convolutions are fitted on.
         held_out: others, on which the loss is measured.
     """
     counts = {kind: len(nodes) for kind, nodes in nodes_by_kind(OnnxGraph(model)).items()}

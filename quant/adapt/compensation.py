@@ -49,7 +49,7 @@ class Networks:
     Attributes:
         original: the original network.
         adapted: the adapted network; its weights change.
-        graph: of the adapted network.
+        graph: the graph of the adapted network.
         images: (1, C, H, W) in [0, 1] that both are run on.
     """
 

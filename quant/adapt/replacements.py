@@ -72,7 +72,7 @@ def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
     """Return the kind of operator that a node is.
 
     Args:
-        graph: that the node belongs to.
+        graph: the graph that the node belongs to.
         node: any node.
 
     Returns:
@@ -106,7 +106,7 @@ def silu_input(graph: OnnxGraph, node: Node) -> str:
     Another c is that of the quick GELU, and the runtime writes ONNX's Swish with one.
 
     Args:
-        graph: that the node belongs to.
+        graph: the graph that the node belongs to.
         node: any node.
 
     Returns:
@@ -132,7 +132,7 @@ def _by_constant(graph: OnnxGraph, node: Node, source: str) -> bool:
     """Return True if a node multiplies a tensor by a constant number.
 
     Args:
-        graph: that the node belongs to.
+        graph: the graph that the node belongs to.
         node: any node.
         source: name of the tensor.
     """
@@ -200,7 +200,7 @@ def _approximation(graph: OnnxGraph, node: Node, kind: Kind) -> Node:
     """Return the node of another function that replaces an activation.
 
     Args:
-        graph: that the node belongs to.
+        graph: the graph that the node belongs to.
         node: the Mul of a SiLU or GELU, a Gelu, a Sigmoid, a LeakyReLU or a PReLU.
         kind: its kind.
     """
@@ -229,7 +229,7 @@ def _two_branches(graph: OnnxGraph, node: Node) -> list[Node]:
     """Return slopes x + ReLU((1 - slopes) x), negated where a slope above 1 bends the other way.
 
     Args:
-        graph: that the node belongs to; its constants are extended.
+        graph: the graph that the node belongs to; its constants are extended.
         node: a LeakyReLU or PReLU with constant slopes.
     """
     slopes = slopes_of(graph, node)
@@ -264,7 +264,7 @@ def _times(graph: OnnxGraph, source: str, factors: np.ndarray, output: str) -> N
     """Return the product of a tensor and one number a channel.
 
     Args:
-        graph: whose constants are extended.
+        graph: the graph whose constants are extended.
         source: name of the tensor (N, C, H, W).
         factors: (C,), or (1,) for all channels.
         output: name of the product and of its node.

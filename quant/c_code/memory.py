@@ -18,7 +18,7 @@ def share_buffers(core: IntCore, sizes: Mapping[str, int]) -> tuple[dict[str, in
 
     Args:
         core: the operations, in order.
-        sizes: of the tensors in bytes, by name.
+        sizes: the sizes of the tensors in bytes, by name.
 
     Returns:
         The number of each tensor's buffer by name, and the sizes of the buffers in bytes.
@@ -58,7 +58,7 @@ def _choose(
         ending: buffers of its inputs that no later operation reads.
         free: buffers that hold no tensor which is read from here on.
         buffers: the sizes of all buffers in bytes, which are extended in place.
-        size: of the result in bytes.
+        size: the size of the result in bytes.
     """
     if isinstance(op, IN_PLACE) and ending:
         return min(ending)

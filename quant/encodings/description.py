@@ -74,7 +74,7 @@ def described_core(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
     """Read a core from its description and from the constants of the same file.
 
     Args:
-        text: of `describe`.
+        text: the text of `describe`.
         constants: weights and biases by name.
 
     Raises:

@@ -36,7 +36,8 @@ def made_explicit(model: onnx.ModelProto, texts: dict[str, str]) -> onnx.ModelPr
     """Return a model that computes the same, and states attributes, shapes and its producer.
 
     Args:
-        model: of ONNX's own operators. Its attributes and descriptions are changed in place.
+        model: the model of ONNX's own operators. Its attributes and descriptions are changed in
+            place.
         texts: descriptions of the graph, its inputs and outputs, by their names.
 
     Returns:
@@ -90,7 +91,7 @@ def _defaults(node: onnx.NodeProto, opset: int) -> Iterator[onnx.AttributeProto]
 
     Args:
         node: any node. One that ONNX does not define has no known defaults.
-        opset: of the model, because defaults depend on it.
+        opset: the opset of the model, because defaults depend on it.
     """
     stated = {attribute.name for attribute in node.attribute}
     if not onnx.defs.has(node.op_type, node.domain):

@@ -23,7 +23,7 @@ def shrinking(graph: OnnxGraph, node: Node) -> list[Node]:
     """Return the nodes in front of a Resize that attention has, the strided convolution first.
 
     Args:
-        graph: that the node belongs to.
+        graph: the graph that the node belongs to.
         node: any node.
 
     Returns:
@@ -63,7 +63,7 @@ def aligned(graph: OnnxGraph, node: Node) -> dict[Node, list[Node]]:
     """Return the nodes that replace a Resize and the reducing nodes in front of it.
 
     Args:
-        graph: that the node belongs to; its constants are extended.
+        graph: the graph that the node belongs to; its constants are extended.
         node: any node.
 
     Returns:

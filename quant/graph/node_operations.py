@@ -36,7 +36,7 @@ def require(condition: bool, node: Node, rule: str, remedy: str = REMEDY) -> Non
 
     Args:
         condition: whether the node meets the rule.
-        node: that the message names.
+        node: the node that the message names.
         rule: a verb phrase for the message: "must ..." or "has ...".
         remedy: a sentence on what to do.
     """

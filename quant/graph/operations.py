@@ -321,7 +321,7 @@ def fold_full_scale(graph: Graph, full_scale: np.ndarray | None) -> Graph:
     """Return the same graph for an image whose channels are divided by their full scale.
 
     Args:
-        graph: that reads the image, by convolutions alone.
+        graph: the graph that reads the image, by convolutions alone.
         full_scale: (C,) the value of each channel that becomes 1; None returns `graph` itself.
     """
     if full_scale is None:

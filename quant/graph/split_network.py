@@ -46,7 +46,7 @@ class SplitNetwork:
 
     Attributes:
         graph: from `IMAGE` to `CORRECTION`, the part that is computed in INT8.
-        channels: of the image, before `front`.
+        channels: the channels of the image, before `front`.
         front: operations of the host on the image: pixel unshuffles.
         back: operations of the host on the correction: pixel shuffles.
         adds_image: whether the image is added to the result (the global add), in the host's float

@@ -32,7 +32,7 @@ class HostPart:
     """The host's part of an INT8 network.
 
     Attributes:
-        channels: of the image behind `front`.
+        channels: the channels of the image behind `front`.
         outputs: channels of the decoded result.
         front: pixel unshuffles of the image.
         back: pixel shuffles of the decoded result.
@@ -40,9 +40,9 @@ class HostPart:
             clipped to that.
         last: pixel shuffles of the sum.
         unit: the share of full scale that is 1 in the decoded result.
-        encoding: of the image for the core.
-        decoding: of the core's result.
-        input_ranges: of the channels of the image in front of `front`.
+        encoding: the encoding of the image for the core.
+        decoding: the decoding of the core's result.
+        input_ranges: the input ranges of the channels of the image in front of `front`.
         limits: to which another result is clipped; empty for none.
     """
 
@@ -66,8 +66,8 @@ class HostPart:
 
         Args:
             network: the float network, split into its core and the host's part.
-            decoding: of the core's result.
-            input_ranges: of the image's channels; empty if all are in [0, 1].
+            decoding: the decoding of the core's result.
+            input_ranges: the input ranges of the image's channels; empty if all are in [0, 1].
         """
         channels = network.core_channels
         return cls(
@@ -284,7 +284,8 @@ def image_encoding(margin_px: int, input_ranges: Ranges) -> InputEncoding:
 
     Args:
         margin_px: the pixels by which the image must at least be mirrored beyond its borders.
-        input_ranges: of the image's channels. If one has values below 0, the encoding is signed.
+        input_ranges: the input ranges of the image's channels. If one has values below 0, the
+            encoding is signed.
     """
     signed = any(low < 0 for low, _ in input_ranges)
     return replace(IMAGE_SLICES, margin_px=margin_px, signed=signed)

@@ -30,7 +30,7 @@ class HostWriter(GraphWriter):
         Args:
             source: the tensor.
             sizes: a constant, the number of channels of each part.
-            names: of the parts.
+            names: the names of the parts.
         """
         node = helper.make_node("Split", [source, sizes], names, axis=1, name="host_back.split")
         self.nodes.append(node)

@@ -111,8 +111,8 @@ def activated(sums: np.ndarray, activation: Activation, frac_bits: int) -> tuple
 
     Args:
         sums: integers.
-        activation: of the operation.
-        frac_bits: of the sums.
+        activation: the activation of the operation.
+        frac_bits: the fractional bits of the sums.
 
     Returns:
         The results, and the number of fractional bits by which they are finer than the sums.

@@ -83,7 +83,7 @@ class LayerReport:
     """The behaviour of one operation on the images that it was run on.
 
     Attributes:
-        name: of the operation.
+        name: the name of the operation.
         peak_bits: bits that the largest accumulator needed, without the sign.
         proven_bits: bits that no input can exceed: 128 times the sum of the weights' absolute
             values, plus the bias.
@@ -107,7 +107,7 @@ def run_core(
         core: the integer core.
         planes: its input.
         half_even: whether ties are rounded to even, as onnxruntime does, instead of up.
-        faults: that are injected.
+        faults: the faults that are injected.
 
     Returns:
         Every tensor by name, as int16, and one report per operation.
@@ -265,7 +265,7 @@ class LayerAgreement:
     """One operation's results, computed three times.
 
     Attributes:
-        report: of the integer reference, which rounds ties up, as the DPU does.
+        report: the report of the integer reference, which rounds ties up, as the DPU does.
         unequal: share of onnxruntime's results that are not the reference's when that rounds ties
             to even.
         moved: share of the results that the DPU's rule changes, here or in a layer before.

@@ -345,9 +345,9 @@ def _all_copies(
 
     Args:
         last: the convolution that writes the copies, as it was.
-        host_part: of the core, as it was.
-        weight: of the copy that was trained, (O, I, kh, kw) in integers.
-        bias: of that copy, (O,), in integers; of a window in units of its scale with the
+        host_part: the host part of the core, as it was.
+        weight: the weight of the copy that was trained, (O, I, kh, kw) in integers.
+        bias: the bias of that copy, (O,), in integers; of a window in units of its scale with the
             offset.
     """
     one = _one_copy(last, host_part)

@@ -225,10 +225,10 @@ class OnnxGraph:
         Args:
             source: the tensor that it reads.
             output: the tensor that it writes.
-            name: of the node.
+            name: the name of the node.
             weight: (O, I / groups, kh, kw), stored as float32.
             bias: (O,), stored as float32; None for none.
-            attributes: of the node, besides the size of its kernel.
+            attributes: the attributes of the node, besides the size of its kernel.
         """
         inputs = [source, self.add_constant(f"{name}.weight", weight)]
         if bias is not None:
@@ -285,7 +285,7 @@ def free_name(name: str, taken: dict[str, int]) -> str:
 
     Args:
         name: the name to begin with.
-        taken: of each name how many others were derived from it.
+        taken: the number of names that were derived from each name.
     """
     candidate = name
     while candidate in taken:

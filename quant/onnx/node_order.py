@@ -13,7 +13,7 @@ def sort_nodes(graph: GraphProto) -> None:
     """Sort the nodes of a graph in place, unless they are sorted or form a cycle.
 
     Args:
-        graph: of a file that has not been checked.
+        graph: the graph of a file that has not been checked.
     """
     nodes = list(graph.node)
     writers = dict[str, int]()

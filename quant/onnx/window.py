@@ -14,9 +14,9 @@ class Window:
     operation, because a convolution's weights have it.
 
     Attributes:
-        strides: of rows and columns.
+        strides: the strides of rows and columns.
         pads: top, left, bottom, right.
-        dilations: of rows and columns.
+        dilations: the dilations of rows and columns.
     """
 
     strides: Pair = (1, 1)

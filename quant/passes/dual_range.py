@@ -55,8 +55,8 @@ def with_windows(
 
     Args:
         graph: a float graph that reads the planes.
-        host_part: of the network.
-        frac_bits: of the result's own scale; windows are finer by GAIN.
+        host_part: the host part of the network.
+        frac_bits: the fractional bits of the result's own scale; windows are finer by GAIN.
         images: (1, C, H, W) on which the result's range is measured.
     """
     plain = host_part.decoding.copies == 1 and not host_part.adds_image

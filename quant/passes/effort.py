@@ -65,7 +65,7 @@ def channel_groups(ranges: np.ndarray, most: int) -> list[np.ndarray]:
     """Divide channels into groups of similar range, whose factors are tried together.
 
     Args:
-        ranges: of the channels, (C,).
+        ranges: the ranges of the channels, (C,).
         most: the maximum number of groups; 0 for none. If it is at least C, each channel is a group
             of its own.
 
@@ -82,7 +82,7 @@ class Stage:
     """One search: of a residual group, of a tensor, or of all single tensors together.
 
     Attributes:
-        tensors: whose channels are scaled.
+        tensors: the tensors whose channels are scaled.
         guesses: number of first guesses.
         channels: number of channels that are tried larger and smaller; 0 for first guesses alone.
     """
@@ -119,9 +119,9 @@ def bound(
     """Return the bound of a search.
 
     Args:
-        stages: of the search.
-        graph: that is searched.
-        work: of each operation on one crop.
+        stages: the stages of the search.
+        graph: the graph that is searched.
+        work: the work of each operation on one crop.
         crops: the number of crops, if there is no bound.
         effort: allowed.
     """

@@ -128,10 +128,10 @@ def channel_sizes(
 
     Args:
         graph: a float graph that reads the planes.
-        names: of the tensors.
+        names: the names of the tensors.
         images: (1, C', H, W).
-        host_part: of the graph.
-        quantile: of the absolute values.
+        host_part: the host part of the graph.
+        quantile: the quantile of the absolute values.
     """
     for results in values_of(graph, names, images, host_part):
         sizes = [np.abs(r[0]).reshape(r.shape[1], -1) for r in results]
@@ -149,7 +149,7 @@ def first_guess(ranges: np.ndarray, gamma: float, headroom: float) -> np.ndarray
     """Return factors that equalize the ranges, and scale the widest to int8.
 
     Args:
-        ranges: of the channels, (C,).
+        ranges: the ranges of the channels, (C,).
         gamma: exponent of the equalization; 0 leaves the ratios of the ranges unchanged, 1 makes
             all equal.
         headroom: the widest range as a share of int8's.
@@ -168,10 +168,10 @@ def search(
     """Return the factors of least error: the best first guess, then step by step.
 
     Args:
-        graph: of which the group is.
+        graph: the graph of which the group is.
         group: to be equalized.
-        ranges: of its channels, (C,).
-        trial: of candidates.
+        ranges: the ranges of its channels, (C,).
+        trial: returns the error of a candidate graph on crops.
         channels: the numbers of those that are tried larger and smaller together.
     """
 

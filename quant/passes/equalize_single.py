@@ -146,11 +146,11 @@ def single_ranges(
     """Return the range of every channel over images (1, C, H, W) that most tiles stay within.
 
     Args:
-        graph: of which the tensors are.
+        graph: the graph of which the tensors are.
         singles: the tensors.
-        images: that are cut to tiles.
-        host_part: of the graph.
-        quantile: of a channel's absolute values in a tile; 1 returns the largest.
+        images: the images that are cut to tiles.
+        host_part: the host part of the graph.
+        quantile: the quantile of a channel's absolute values in a tile; 1 returns the largest.
         tiles: the quantile of these over the tiles.
     """
     sizes = channel_sizes(graph, list(singles.tensors), images, host_part, quantile)
@@ -170,12 +170,12 @@ def equalize_single(
     """Return the factors of least error, never more than that of `start`.
 
     Args:
-        graph: of which the tensors are.
+        graph: the graph of which the tensors are.
         singles: to be equalized.
-        ranges: of their channels, (sum of the channels,).
+        ranges: the ranges of their channels, (sum of the channels,).
         start: factors, of the same shape.
-        trials: of candidates.
-        effort: of the search.
+        trials: measure the error of candidate graphs on crops.
+        effort: the effort of the search.
         most_groups: most groups of channels that are tried larger and smaller; 0 for the guesses
             for all tensors alone.
     """

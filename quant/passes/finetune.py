@@ -67,7 +67,7 @@ class Pace:
     """How far the steps of a round go.
 
     Attributes:
-        share: of the highest rate.
+        share: the share of the highest rate.
         by_tensor: whether a gradient is divided by the root mean square of its whole tensor, and
             not number by number, as Adam does. Number by number, small gradients that are mostly
             noise move their numbers as far as others. Once all these cross their rounding
@@ -93,7 +93,7 @@ class Tuning:
         steps: the number of gradient steps; None adds rounds until the error on held-out pairs
             stops falling.
         rate: the highest learning rate, in units of each number's scale.
-        seed: of the order of the pairs.
+        seed: the seed of the order of the pairs.
         original: the float network whose results are learnt; None for that of the rounded graph,
             which differs if operators were replaced (`quant.adapt`).
     """
@@ -111,11 +111,11 @@ class Sample:
 
     Attributes:
         image: (1, C, H, W) in [0, 1].
-        planes: of the image, (1, P, H, W) as float32.
+        planes: the planes of the image, (1, P, H, W) as float32.
         floats: the float network's correction.
         reference: the correction that would restore it completely, or None.
-        weight: of its errors: one over the float network's own error, so that dark and busy patches
-            count equally. A number, or (N, 1, 1, 1) of a batch.
+        weight: the weight of its errors: one over the float network's own error, so that dark and
+            busy patches count equally. A number, or (N, 1, 1, 1) of a batch.
     """
 
     image: np.ndarray
@@ -357,7 +357,7 @@ def _inner_error(result: Tensor, target: Tensor, weight: float | Tensor = 1.0) -
     Args:
         result: corrections (N, C, H', W').
         target: the corrections that they should be, of the same shape.
-        weight: of each correction's error.
+        weight: the weight of each correction's error.
 
     Returns:
         A tensor of one number. A small result is compared as a whole.

@@ -75,7 +75,7 @@ def search_targets(
 
     Args:
         graph: a float graph that reads the planes.
-        host_part: of the graph.
+        host_part: the host part of the graph.
         images: (1, C, H, W).
         count: the number of crops; fewer are returned if there are not enough.
     """

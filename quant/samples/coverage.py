@@ -75,7 +75,7 @@ def histogram(sample: np.ndarray) -> np.ndarray:
     """Count the pixels of a sample by value.
 
     Args:
-        sample: of any shape, with values in [0, 1].
+        sample: the sample of any shape, with values in [0, 1].
 
     Returns:
         (BINS,) counts; the last bin also holds the value 1.

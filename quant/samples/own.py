@@ -59,9 +59,9 @@ class OwnSamples:
     """A user's samples, which replace `quant.samples.simulated.Calibration`.
 
     Attributes:
-        name: of their file.
+        name: the name of their file.
         samples: each with its name.
-        ranges: of their channels; empty if all are in [0, 1].
+        ranges: the ranges of their channels; empty if all are in [0, 1].
         stated: whether the user states the ranges.
     """
 
@@ -173,8 +173,8 @@ def read_samples(
         fixed_px: side of the image that the network is fixed to; None cuts large samples to
             patches.
         multiple_px: sides are cut to multiples of it.
-        ranges: that the values must be in, and onto which pixels of image files are mapped; None
-            determines them.
+        ranges: the ranges that the values must be in, and onto which pixels of image files are
+            mapped; None determines them.
 
     Raises:
         ImageError: samples that the network does not accept, or samples without any contrast.

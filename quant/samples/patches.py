@@ -48,9 +48,9 @@ class Patches:
         pairs: (degraded, reference) of each patch.
         degraded: the same degraded patches without references, which takes half the time to
             simulate.
-        names: of a user's own samples, for messages; empty for simulated patches.
+        names: the names of a user's own samples, for messages; empty for simulated patches.
         views: the ground of each simulated patch, and its sensors; empty for a user's own samples.
-        ranges: of the channels of the images; empty if all are in [0, 1].
+        ranges: the ranges of the channels of the images; empty if all are in [0, 1].
     """
 
     pairs: Sequence[Pair]

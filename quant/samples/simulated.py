@@ -61,9 +61,9 @@ def draw_patches(
         degraded: the sensors that acquire them, unless there is a family.
         reference: the sensor of the target images.
         count: the number of patches.
-        seed: of all random draws.
+        seed: the seed of all random draws.
         patch_px: side of a patch.
-        family: of sensors with the gain and bits of `degraded`.
+        family: the family of sensors with the gain and bits of `degraded`.
         lightings: how the ground is lit, so that the patches cover the sensor's range; without any
             it is as bright as in the scenes.
 
@@ -162,7 +162,7 @@ def unseen_patches(degraded: Sensor, images: Path | None, patches: int, seed: in
         degraded: the sensor's profile; the reference is the one that belongs to it.
         images: folder of scenes; None for drawn ones, which differ from calibration's.
         patches: the number of patches.
-        seed: of the calibration.
+        seed: the seed of the calibration.
     """
     reference = degraded.reference
     # Another seed draws other scenes, and other patches of the same images.

@@ -94,8 +94,8 @@ def stored_samples(
 
     Args:
         source: a file of a batch, a folder of files of one image each, or samples in memory.
-        ranges: of the network's channels, onto which 0 to full scale of image files are mapped;
-            empty for [0, 1].
+        ranges: the ranges of the network's channels, onto which 0 to full scale of image files are
+            mapped; empty for [0, 1].
     """
     if not isinstance(source, Path):
         for number, pair in enumerate(source):

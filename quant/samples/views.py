@@ -155,7 +155,7 @@ def stratified(
         candidates: at least `count` of them.
         key: by which they are sorted.
         count: the number of groups.
-        generator: of the draws.
+        generator: the generator of the draws.
 
     Returns:
         One candidate of each group, in random order.
@@ -235,9 +235,9 @@ def light_factor(
 
     Args:
         lighting: the way.
-        radiance: of the ground, in W/m2/sr/um.
+        radiance: the radiance of the ground, in W/m2/sr/um.
         full_scale: the radiance that the sensor's largest digital number stands for.
-        generator: of the random part.
+        generator: the generator of the random part.
     """
     if lighting == "as drawn":
         return 1.0

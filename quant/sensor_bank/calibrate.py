@@ -89,10 +89,10 @@ def _analytic(scale: int, result: int, shifts: Shifts, decoding: BankSum, inputs
     Its fine results are rounded at other places of a step each; a coarse one is the coarse copy.
 
     Args:
-        scale: of the network.
+        scale: the scale of the network.
         result: the fractional bits of the correction, which the results are stated to have as well.
         shifts: the windows of the target.
-        decoding: of the results.
+        decoding: the decoding of the results.
         inputs: the number of the bank's channels of each pixel, the analytic restoration last.
     """
     pixels = scale**2
@@ -189,10 +189,10 @@ def bank_results(
 
     Args:
         image: the image.
-        bank: of the sensor.
+        bank: the bank of the sensor.
         vector: the sensor vector (4,).
         scale: S of the network.
-        kernels: of the bank.
+        kernels: the kernels of the bank.
     """
     integers = integer_bank(bank, scale, 1, kernels)
     planes = bank_host_part(scale, BankSum()).encode(image)
@@ -217,12 +217,12 @@ def quantize_behind_bank(
     """Quantise a network behind a bank; its core is for the middle of the range of sensors.
 
     Args:
-        weights: of a `BankedConvBEERS`.
-        bank: of the middle of the range.
-        images: of `bank_results`, of sensors from the whole range.
+        weights: the weights of a `BankedConvBEERS`.
+        bank: the bank of the middle of the range.
+        images: the images of `bank_results`, of sensors from the whole range.
         shifts: the windows of the target.
-        passes: that reduce the error.
-        effort: of the search for equalization factors.
+        passes: the passes that reduce the error.
+        effort: the effort of the search for equalization factors.
     """
     body, _ = rounded(_plan(weights, shifts, passes, effort), images)
     biases = {op.name: _biases(op) for op in body.convolutions}
@@ -302,9 +302,9 @@ def bank_images(
 
     Args:
         scenes: to simulate images of.
-        scale: of the network.
-        seed: of all random draws.
-        kernels: of the banks.
+        scale: the scale of the network.
+        seed: the seed of all random draws.
+        kernels: the kernels of the banks.
     """
     like = Sensor.load(LIKE)
     reference = Sensor.load(REFERENCE)

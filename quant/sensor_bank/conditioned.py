@@ -45,9 +45,9 @@ class ConditionedCore:
 
     Attributes:
         core: for the middle of the range of sensors, or for the sensor of its file.
-        biases: of the convolutions behind the bank, by name, at a gain of 1: (O, 1). For those that
-            read the bank (O, 5): the bias for the middle of the range, and the addition per value
-            of a sensor vector.
+        biases: the biases of the convolutions behind the bank, by name, at a gain of 1: (O, 1). For
+            those that read the bank (O, 5): the bias for the middle of the range, and the addition
+            per value of a sensor vector.
         shifts: the windows of the target.
     """
 
@@ -158,7 +158,7 @@ def with_delta(core: IntCore, delta: bytes, where: str = "The delta") -> tuple[I
     """Return a core conditioned on the sensor of a delta, and that sensor's name.
 
     Args:
-        core: of the network that the delta was made for.
+        core: the core of the network that the delta was made for.
         delta: its bytes.
         where: its name at the beginning of messages.
 

@@ -109,10 +109,10 @@ def integer_bank(bank: Bank, scale: int, gain: float, kernels: Kernels = "fitted
     """Quantise a bank for a network.
 
     Args:
-        bank: of the sensor.
-        scale: of the network.
+        bank: the bank of the sensor.
+        scale: the scale of the network.
         gain: the factor by which the steps of the results are finer.
-        kernels: of the bank.
+        kernels: the kernels of the bank.
     """
     steps = np.concatenate([bank.kernels, bank.kernels[-1:] / WIDE])
     # The kernels multiply shares of full scale, but the planes hold digital numbers.

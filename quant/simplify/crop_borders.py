@@ -15,8 +15,8 @@ def convolve_crop(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | 
     """Return the depthwise convolution that a Slice of rows and columns is.
 
     Args:
-        shapes: of each float tensor.
-        graph: that the node belongs to; its constants are extended.
+        shapes: the shapes of each float tensor.
+        graph: the graph that the node belongs to; its constants are extended.
         node: any node.
 
     Returns:

@@ -49,8 +49,8 @@ def negate_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[
     """Negate the subtrahend by a convolution of its own, and add the result (1).
 
     Args:
-        shapes: of each float tensor.
-        graph: that the node belongs to; its constants are extended.
+        shapes: the shapes of each float tensor.
+        graph: the graph that the node belongs to; its constants are extended.
         node: any node.
 
     Returns:

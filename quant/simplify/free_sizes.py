@@ -72,8 +72,8 @@ def _of_size(model: onnx.ModelProto, rows: int, columns: int, fold: Fold) -> onn
 
     Args:
         model: a float network; not changed.
-        rows: of the image.
-        columns: of the image.
+        rows: the rows of the image.
+        columns: the columns of the image.
         fold: folds the constants of a network.
     """
     network = deepcopy(model)
@@ -100,9 +100,9 @@ def _sized(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> l
     """Return the nodes that replace a node whose input has a known size (2).
 
     Args:
-        graph: that the node belongs to; its constants are extended.
+        graph: the graph that the node belongs to; its constants are extended.
         node: any node.
-        sizes: of each tensor, for the images that are tried.
+        sizes: the sizes of each tensor, for the images that are tried.
 
     Returns:
         The nodes with the same result; None if the node stays.
@@ -142,9 +142,9 @@ def _unshuffled(
     """Return the pixel unshuffle that ends in a Reshape.
 
     Args:
-        graph: that the node belongs to.
+        graph: the graph that the node belongs to.
         node: a Reshape, or another operator that moves no value.
-        sizes: of each tensor, for the images that are tried.
+        sizes: the sizes of each tensor, for the images that are tried.
 
     Returns:
         A SpaceToDepth of the image; None if the nodes are no pixel unshuffle of one channel.
@@ -177,7 +177,7 @@ def _with_written_maps(
     """Return a Concat whose constant maps are written by convolutions with weights of zero.
 
     Args:
-        graph: that the node belongs to; its constants are extended.
+        graph: the graph that the node belongs to; its constants are extended.
         node: the Concat.
         before: sizes (N, C, H, W) of its first input, which the convolutions read.
         after: sizes of its result.

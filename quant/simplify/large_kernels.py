@@ -30,7 +30,7 @@ def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Return the parts of a convolution with a large kernel, and their sum.
 
     Args:
-        graph: that the node belongs to; its constants are extended.
+        graph: the graph that the node belongs to; its constants are extended.
         node: any node.
 
     Returns:

@@ -24,7 +24,7 @@ def join_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a Clip or a Max that is a ReLU (1).
 
     Args:
-        graph: that the node belongs to.
+        graph: the graph that the node belongs to.
         node: any node.
 
     Returns:
@@ -48,7 +48,7 @@ def join_hard_swish(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a node that completes a HardSwish, or a HardSigmoid, by that operator (2).
 
     Args:
-        graph: that the node belongs to.
+        graph: the graph that the node belongs to.
         node: any node; nodes in front of it are removed if nothing else reads them.
 
     Returns:
@@ -70,7 +70,7 @@ def halve_before_gelu(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Move the half of a GELU in front of its product (3).
 
     Args:
-        graph: that the node belongs to.
+        graph: the graph that the node belongs to.
         node: any node.
 
     Returns:
@@ -144,7 +144,7 @@ def other_operand(graph: OnnxGraph, node: Node | None, kind: str, number: float)
     """Return the tensor that a node of this operator combines with a constant number.
 
     Args:
-        graph: that the node belongs to.
+        graph: the graph that the node belongs to.
         node: any node; None returns None.
         kind: an operator of two operands, in any order but for Div, whose constant divides.
         number: the constant, up to the rounding of float32.

@@ -25,8 +25,8 @@ def split_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] |
     """Return operations that compute the parts of a map (1).
 
     Args:
-        shapes: of each float tensor.
-        graph: that the node belongs to; its constants are extended.
+        shapes: the shapes of each float tensor.
+        graph: the graph that the node belongs to; its constants are extended.
         node: any node.
 
     Returns:
@@ -46,9 +46,9 @@ def _parts(graph: OnnxGraph, node: Node, shapes: Shapes) -> list[Part]:
     """Return the parts of a map of known channels that a node selects; none for another node.
 
     Args:
-        graph: that the node belongs to.
+        graph: the graph that the node belongs to.
         node: any node.
-        shapes: of each float tensor.
+        shapes: the shapes of each float tensor.
     """
     numbers = np.arange(channels_in(shapes, node.inputs[0]) if node.inputs else 0)
     if not len(numbers):
@@ -70,9 +70,9 @@ def _compute(
     Args:
         graph: its constants are extended by the weights of the part.
         source: the map.
-        shapes: of each float tensor.
+        shapes: the shapes of each float tensor.
         channels: the numbers of the channels, (C,).
-        name: of the part.
+        name: the name of the part.
         divides: whether the map is never needed as a whole (2), or the channels are selected (3).
     """
     before = graph.writers.get(source) if divides else None

@@ -20,8 +20,9 @@ def unshuffle_slices(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node]
     """Return the pixel unshuffle that a Concat of slices is (1).
 
     Args:
-        shapes: of each float tensor.
-        graph: that the node belongs to; convolutions that read the result get other weights.
+        shapes: the shapes of each float tensor.
+        graph: the graph that the node belongs to; convolutions that read the result get other
+            weights.
         node: any node.
 
     Returns:
@@ -70,9 +71,9 @@ def _order(graph: OnnxGraph, node: Node, channels: int, block: int) -> np.ndarra
     """Return the unshuffle's channels in the order of a Concat, or None if pixels differ.
 
     Args:
-        graph: that the slices belong to.
+        graph: the graph that the slices belong to.
         node: the Concat.
-        channels: of the map that is sliced.
+        channels: the channels of the map that is sliced.
         block: side of the unshuffle's blocks in pixels.
     """
     shape = (1, channels, 4 * block, 6 * block)

@@ -43,10 +43,10 @@ class AxisMap:
         """Return the first and the last pixel of the source that pixels of the result read.
 
         Args:
-            first: of the result's pixels.
-            last: of them.
-            size: of the source where the image is one cell of the lattice: it may end on either
-                side of it.
+            first: the first of the result's pixels.
+            last: the last of the pixels.
+            size: the size of the source where the image is one cell of the lattice: it may end on
+                either side of it.
         """
         low = math.ceil(first / self.growth + self.low)
         high = math.floor(last / self.growth + self.high)
@@ -65,7 +65,7 @@ class AxisNode:
         axis: 0 for the rows, 1 for the columns.
         extra: pixels that its source has beyond, or short of, its share of the image.
         graph: the node's.
-        shapes: of all constants, including those that nodes compute from others.
+        shapes: the shapes of all constants, including those that nodes compute from others.
     """
 
     node: Node

@@ -63,7 +63,7 @@ def host_parts_s(units: Array, constants: Constants) -> Array:
 
     Args:
         units: amounts of work as `host_work` returns them, (n, 7).
-        constants: of the board.
+        constants: the constants of the board.
     """
     times = units * constants.host_s_per_unit
     return np.stack([times[:, :COPIES].sum(axis=1), times[:, COPIES:].sum(axis=1)], axis=1)

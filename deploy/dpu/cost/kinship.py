@@ -26,7 +26,7 @@ def levels_of(operations: Sequence[Operation], dpu: Dpu, bound: str) -> Levels:
     """Return the keys of the levels at which a run is related to others, one for each of SHARES.
 
     Args:
-        operations: of the network, in order.
+        operations: the operations of the network, in order.
         dpu: the configuration that it runs on.
         bound: what sets its rate by the prediction, the host or the DPU.
     """
@@ -47,7 +47,7 @@ def correction(of: Levels, runs: Sequence[tuple[Levels, float]]) -> tuple[float,
 
     Args:
         of: the network.
-        runs: of the owner, each with its ln(given / predicted).
+        runs: the runs of the owner, each with its ln(given / predicted).
     """
     if not runs:
         return 1.0, 1.0

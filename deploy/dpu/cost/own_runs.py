@@ -38,9 +38,9 @@ class Entry:
         model: the path of the network, relative to the file.
         fps: frames per second.
         tile_px: side of a tile in pixels.
-        configuration: of the DPU; the board's default if None.
+        configuration: the configuration of the DPU; the board's default if None.
         target: the board, if it is another one with the same DPU.
-        provider: of onnxruntime.
+        provider: the provider of onnxruntime.
         power_w: not used, because runs correct rates alone.
     """
 

@@ -36,8 +36,8 @@ class Fault:
     """A faulty pixel, column or row.
 
     Attributes:
-        column: of the image, from 0; -1 for all of a row.
-        row: of the image, from 0; -1 for all of a column.
+        column: the column of the image, from 0; -1 for all of a row.
+        row: the row of the image, from 0; -1 for all of a column.
         band: from 1; 0 for all bands.
     """
 
@@ -123,7 +123,7 @@ def read_list(path: Path, raster: Raster) -> FaultList:
 
     Args:
         path: the path of the file.
-        raster: of the image.
+        raster: the raster of the image.
     """
     reason = "lists none"
     lines = list[str]()

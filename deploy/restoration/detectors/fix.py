@@ -53,7 +53,7 @@ def faults_of(source: Source, source_name: str, name: str) -> FaultList:
     Args:
         source: the image.
         source_name: 'found', or the file of a list; empty for none.
-        name: of the image, for messages.
+        name: the name of the image, for messages.
     """
     if not source_name:
         return FaultList(())
@@ -80,7 +80,7 @@ def find_faults(source: Source, name: str) -> FaultList:
 
     Args:
         source: the image.
-        name: of the image, for messages.
+        name: the name of the image, for messages.
     """
     raster = source.raster
     lines = set[Fault]()

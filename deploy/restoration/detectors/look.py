@@ -55,9 +55,9 @@ class BandFaults:
     """The faults found in one band.
 
     Attributes:
-        columns: of the image, whose lines have the image's numbers.
+        columns: the columns of the image, whose lines have the image's numbers.
         rows: likewise, of the rows that were checked.
-        patterns: of period 2.
+        patterns: the patterns of period 2.
         pixels: row and column (n, 2) of single wrong pixels among those that were checked.
         looked_px: the number of pixels that were checked.
     """

@@ -60,7 +60,7 @@ class SensorCheck:
         """Log a warning for each contradiction.
 
         Args:
-            name: of the image, for messages.
+            name: the name of the image, for messages.
             sensor: its profile's name.
             strict: if True, a contradiction is an error instead.
 
@@ -90,7 +90,7 @@ def checked_sensor(
         source: the image.
         sensors: by band, or under "" if one is for all; empty or blind if none is known.
         full_scale: the pixel value that is the sensors' largest digital number.
-        name: of the image, for messages.
+        name: the name of the image, for messages.
         strict: if True, a contradiction is an error instead of a warning.
 
     Raises:

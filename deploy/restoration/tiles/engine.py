@@ -65,7 +65,7 @@ class Restorer:
         full_scale: the pixel value that is 1.0 to the network.
         plan: how the image is cut. Missing pixels are filled from no farther away than the halo of
             its tiling geometry. Pixels beyond that, filled or not, do not influence a known pixel.
-        name: of the image, for messages.
+        name: the name of the image, for messages.
         clips: if True, values above full scale are clipped and counted; else they are an error.
         consistency: the consistency step, one for all bands or one for each; empty if it is
             omitted, None for a band without it.
@@ -278,7 +278,7 @@ def checked_strip(
         top: the first row.
         pixels: (bands, rows, width) values as stored.
         full_scale: the pixel value that is the largest digital number.
-        name: of the image, for messages.
+        name: the name of the image, for messages.
         clips: True to accept values above full scale, which are clipped later.
         left: the first column, if the rows do not begin at the image's border.
 

@@ -116,7 +116,7 @@ def _finish(
     """Store the retained pixels (bands, h, w) of one tile.
 
     Args:
-        restorer: of its band.
+        restorer: the restorer of its band.
         strip: its raw pixels.
         around: the results of `_tile` for the tiles within reach, in rows.
         at: row and column of the first pixel of these.

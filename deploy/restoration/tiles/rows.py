@@ -217,9 +217,9 @@ def gathered(
     """Gather all restored rows of an image, from the top.
 
     Args:
-        rows: of tiles or strips, in order.
-        shape: of the restored image, (bands, H, W).
-        dtype: of its pixels.
+        rows: the rows of tiles or strips, in order.
+        shape: the shape of the restored image, (bands, H, W).
+        dtype: the dtype of its pixels.
 
     Returns:
         The pixels, and their statistics.

@@ -35,9 +35,9 @@ class Frames:
     """Raw frames of one camera at one setting.
 
     Attributes:
-        paths: of the images, sorted as given.
+        paths: the paths of the images, sorted as given.
         step: the stored step of one digital number, of which all stored values are multiples.
-        bits: of a digital number.
+        bits: the bits of a digital number.
         bits_stated: True if the user states them.
         black_dn: the digital number of the dark, subtracted from all that is measured.
         darkest_dn: the digital number of the darkest pixels, the black level included.
@@ -88,7 +88,8 @@ def open_frames(images: Sequence[Path], bits: int | None, black_level: float | N
 
     Args:
         images: files, and folders whose images are sorted by name.
-        bits: of a digital number, or of a stored value; None to infer them from clipped pixels.
+        bits: the bits of a digital number, or of a stored value; None to infer them from clipped
+            pixels.
         black_level: the stored value of the dark; None uses 0.
     """
     paths: tuple[Path, ...] = ()

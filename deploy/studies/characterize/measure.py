@@ -128,10 +128,10 @@ def measure_mtf(
     """Measure the MTF across (edges near the vertical) and along the track.
 
     Args:
-        frames: of the camera.
+        frames: the frames of the camera.
         boxes: pixels (h, w) with one edge each, by their description; if empty, all frames are
             searched.
-        noise: of the pixels, above the dark.
+        noise: the noise of the pixels, above the dark.
     """
 
     def variance(dn: np.ndarray) -> np.ndarray:

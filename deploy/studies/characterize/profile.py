@@ -41,7 +41,7 @@ class Stated:
     """The values that the user states about a camera; None if a value is measured or assumed.
 
     Attributes:
-        bits: of a digital number.
+        bits: the bits of a digital number.
         gain: DN per W/m2/sr/um.
         gsd_m: ground sampling distance.
         black_level: value of the dark in the files.

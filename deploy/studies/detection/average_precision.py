@@ -179,7 +179,7 @@ def score_rows(
     Args:
         rows: rows of the same images. The confidence is that of the best F1 of the first row on all
             images.
-        names: of the classes.
+        names: the names of the classes.
         weights: (W, I), the weight of each image, as `site_weights` returns it.
     """
     confidence = float(score(next(iter(rows.values())), names, weights[:1])["own confidence"][0])
@@ -192,8 +192,8 @@ def score(
     """Return every figure of a row, (W,) each.
 
     Args:
-        hits: of the row.
-        names: of the classes.
+        hits: the hits of the row.
+        names: the names of the classes.
         weights: (W, I) integers, the weight of each image.
         confidence: where `precision` and `recall` are sampled. `own precision` and `own recall` are
             sampled at `own confidence`, that of the row's best F1.
@@ -251,7 +251,7 @@ def precisions(
     recall or more (COCO).
 
     Args:
-        hits: of a row.
+        hits: the hits of a row.
         kind: number of the class.
         weights: (W, I) the weight of each image.
         size: number of a range of `SIZES_PX`.

@@ -148,8 +148,8 @@ class Letterbox:
     Downscaling samples bilinearly without a prefilter, as Ultralytics does when it trains and runs.
 
     Args:
-        height_px: of the image.
-        width_px: of the image.
+        height_px: the height of the image.
+        width_px: the width of the image.
         size_px: side of the input.
     """
 

@@ -54,7 +54,7 @@ class Detector:
     """A detector ready to run.
 
     Attributes:
-        names: of its classes, in its order.
+        names: the names of its classes, in its order.
         size_px: side of its square input.
         flag: a sentence on why its average precision is too low; empty if nothing is dropped.
     """
@@ -106,7 +106,7 @@ def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> D
 
     Args:
         path: an ONNX file.
-        threads: of onnxruntime; 0 uses one thread for each core.
+        threads: the threads of onnxruntime; 0 uses one thread for each core.
         size_px: side of the input; None uses the size that the file is fixed to or was trained for.
     """
     model = load_onnx(path)

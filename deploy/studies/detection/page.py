@@ -50,8 +50,8 @@ def write_page(compared: Sequence[Comparison], table: Table, path: Path) -> None
 
     Args:
         compared: comparisons of one set of scenes.
-        table: of their figures.
-        path: of the page.
+        table: the table of their figures.
+        path: the path of the page.
     """
     tables = [
         Section(name, rows, CAPTIONS.get(name.split(",")[0], ""))

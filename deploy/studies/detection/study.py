@@ -42,10 +42,10 @@ class LabelledScene:
     """A scene, and the objects in it that the detector knows.
 
     Attributes:
-        name: of the file.
+        name: the name of the file.
         site: its place; scenes of one site resemble one another.
         truth: labelled boxes in scene pixels, of the detector's classes.
-        path: of the file; None for a scene in memory.
+        path: the path of the file; None for a scene in memory.
         radiance: returns the scene (H, W) in W/m2/sr/um. A picture's white is the full scale of the
             given sensor.
     """
@@ -125,7 +125,7 @@ class Comparison:
         hits: which of them found an object, by row.
         figures: by row.
         confidence: the confidence at which precision and recall are sampled in every row.
-        names: of the classes.
+        names: the names of the classes.
     """
 
     sensors: SensorPair
@@ -163,10 +163,10 @@ def run_study(
     Args:
         detector: the detector that runs on the images.
         scenes: labelled.
-        sensors: of the degraded images.
+        sensors: the sensors of the degraded images.
         methods: names of the rows besides the reference, the degraded images among them.
         reference: profile of the reference images; None for the default one.
-        seed: of every random draw.
+        seed: the seed of every random draw.
     """
     cases = []
     # A method that does not exist is refused before anything is detected.
@@ -223,7 +223,7 @@ def labelled_scenes(
     on what is left out.
 
     Args:
-        names: of the classes that the detector knows.
+        names: the names of the classes that the detector knows.
         mapping: the detector's names by labelled ones, where letters do not match.
         images: as `read_labelled` accepts it.
         labels: their path, if not next to the pictures.

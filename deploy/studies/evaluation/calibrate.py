@@ -53,7 +53,7 @@ def calibrate_network(evaluation: Evaluation, name: str, source: Path, out: Path
 
     Args:
         evaluation: the evaluation.
-        name: of the method that is the network.
+        name: the name of the method that is the network.
         source: the file.
         out: the copy.
     """
@@ -71,7 +71,8 @@ def interval_from_pairs(
     others.
 
     Args:
-        pairs: of at least two sites. The truth is the reference without noise where it is known.
+        pairs: the pairs of at least two sites. The truth is the reference without noise where it is
+            known.
         restore: the restoration.
         sensor: the sensor that acquired the pairs.
 

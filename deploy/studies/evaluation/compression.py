@@ -59,7 +59,7 @@ class Decompressed:
 
     Attributes:
         dn: digital numbers (H, W) float32.
-        rate: of its code, in bits per pixel.
+        rate: the rate of its code, in bits per pixel.
     """
 
     dn: np.ndarray
@@ -71,7 +71,7 @@ def check_rates(rates: Iterable[float], bits: int) -> list[float]:
 
     Args:
         rates: in bits per pixel.
-        bits: of the sensor.
+        bits: the bits of the sensor.
 
     Raises:
         OptionError: a rate is not above 0 and at most the bits of the sensor.
@@ -91,7 +91,7 @@ def lossless_rate(dn: np.ndarray, bits: int) -> float:
 
     Args:
         dn: digital numbers (H, W), which are rounded.
-        bits: of a digital number.
+        bits: the bits of a digital number.
     """
     return 8 * len(_code(_rounded(dn, bits))) / dn.size
 
@@ -102,7 +102,7 @@ def decompressed(dn: np.ndarray, rate: float, bits: int) -> Decompressed:
     Args:
         dn: digital numbers (H, W), which are rounded.
         rate: in bits per pixel.
-        bits: of a digital number.
+        bits: the bits of a digital number.
     """
     # OpenJPEG controls the rate more finely if the upper bits of the container are used. The error
     # at a rate is the same within 0.5 %.
@@ -145,9 +145,9 @@ class Trial:
         board_db: PSNR of the images restored on board, (N,).
         ground_db: PSNR of those restored on the ground, by the share of the error that counts as
             noise, (S, N); of a method that uses no sensor profile, S is 1.
-        rates: of the codes on board and on the ground, in bits per pixel, (2, N).
+        rates: the rates of the codes on board and on the ground, in bits per pixel, (2, N).
         error_dn2: mean squared error of the images that reach the ground, (N,).
-        sites: of the images, (N,).
+        sites: the sites of the images, (N,).
     """
 
     board_db: np.ndarray
@@ -211,10 +211,10 @@ def run_compression(
 
     Args:
         methods: the methods; the degraded input is left out.
-        pairs: of images.
+        pairs: the pairs of images.
         sensor: the sensor that acquired the images.
         rates: in bits per pixel; without any, no row is returned.
-        seed: of the bootstrap.
+        seed: the seed of the bootstrap.
 
     Returns:
         A row for each method and rate, then one for each method with its lossless rates.
@@ -252,7 +252,7 @@ def try_method(
 
     Args:
         method: the method that restores.
-        pairs: of images.
+        pairs: the pairs of images.
         restored: the degraded images of the pairs, restored.
         raw: the same images, decompressed.
         rate: in bits per pixel.

@@ -59,7 +59,7 @@ def pairs_of_scenes(
         images: the folder; drawn scenes if None.
         degraded: profile of the degraded images.
         reference: profile of the reference images.
-        seed: of every random draw.
+        seed: the seed of every random draw.
         brightness: factor of the scenes' radiance.
     """
     scenes = scenes_at(brightness, load_scenes(images, reference.nominal(), seed))
@@ -109,7 +109,7 @@ def simulate_pairs(
         scenes: the scenes.
         degraded: the same sensor for all scenes, or a profile from which one is drawn for each.
         reference: likewise.
-        seed: of every random draw.
+        seed: the seed of every random draw.
         oversamplings: scene pixels per pixel.
 
     Returns:

@@ -55,7 +55,7 @@ class Evaluation(Table):
     """Methods compared on the same pairs: means, sites, images, and other sensors if requested.
 
     Attributes:
-        sensors: of the degraded and of the reference images.
+        sensors: the sensors of the degraded and of the reference images.
         methods: as they were run.
         pairs: the pairs that they were run on.
     """
@@ -77,17 +77,17 @@ class Plan:
 
     Attributes:
         methods: names, networks or functions, by the name of their row.
-        sensors: of the degraded and of the reference images.
+        sensors: the sensors of the degraded and of the reference images.
         scenes: folder of scenes to simulate pairs from; None for drawn ones.
-        folder: of stored pairs; None if there are none.
+        folder: the folder of stored pairs; None if there are none.
         given: pairs in memory; None if there are none.
         lpips: weights for LPIPS, or None.
-        factors: of the scenes' radiance; the first is 1.
+        factors: the factors of the scenes' radiance; the first is 1.
         rates: bits per pixel to which images are compressed before or after restoration.
         sweep: True to compare other blurs, noises and gains too.
         strict: True to refuse stored pairs that contradict the sensor.
         around: the steps around networks that are used.
-        seed: of every random draw.
+        seed: the seed of every random draw.
     """
 
     methods: Mapping[str, NetworkLike | Restore]

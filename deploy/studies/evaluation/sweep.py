@@ -108,9 +108,9 @@ def run_sweep(
         methods: the methods, of which the networks are run. Each condition's sensor is given to
             those that can use it.
         images: folder of the scenes; drawn ones if None.
-        profile: of the sensor from which the conditions depart.
+        profile: the profile of the sensor from which the conditions depart.
         reference: profile of the sensor that is aimed at.
-        seed: of every random draw.
+        seed: the seed of every random draw.
         brightness: factor of the scenes' radiance. The MTF is measured only at 1, because edges do
             not depend on it.
     """
@@ -188,8 +188,8 @@ class SweepResult:
             noise.
         mtf: after restoration, with the true sensor known, and for the pipeline that assumes the
             nominal one.
-        sites: of the images, (N,).
-        seed: of the bootstrap.
+        sites: the sites of the images, (N,).
+        seed: the seed of the bootstrap.
         brightness: factor of the scenes' radiance.
     """
 

@@ -80,7 +80,7 @@ class Pattern:
     """Bars or a zone plate.
 
     Attributes:
-        name: of the figure.
+        name: the name of the figure.
         acquired: the image that the degraded sensor acquires, (H, W) digital numbers.
         expected: the image that the reference sensor acquires without noise, likewise.
         measured: True where the restored image is compared, (H, W).

@@ -72,8 +72,8 @@ def run_battery(
         subject: the networks.
         cases: the hard cases that they restore.
         stages: names of STAGES.
-        seed: of the images.
-        side_px: of images whose case has no size of its own.
+        seed: the seed of the images.
+        side_px: the side of images whose case has no size of its own.
     """
     results = []
     reasons = {stage: _obstacle(subject, stage) for stage in stages}

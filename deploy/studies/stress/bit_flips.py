@@ -55,8 +55,8 @@ def flip_table(subject: Subject, source: Calibration, board: TargetProfile) -> T
 
     Args:
         subject: with an INT8 network.
-        source: of the patches that flips are tried on, one for each injection into each kind of
-            memory at each rate.
+        source: the source of the patches that flips are tried on, one for each injection into each
+            kind of memory at each rate.
         board: the board whose cost model predicts the cost of the guards.
     """
     # A file without an integer core is refused before anything is drawn.
@@ -153,7 +153,7 @@ def curve_rows(target: FaultTarget, draws: int, seed: int) -> list[Row]:
         target: the network, its guards and the patches.
         draws: injections for each kind of memory and rate; kinds that are seldom hit get a
             multiple.
-        seed: of the flips.
+        seed: the seed of the flips.
 
     Returns:
         Rows of the table "bit flips", with the PSNR in dB for each set of guards.
@@ -198,10 +198,10 @@ def _drawn(
 
     Args:
         target: the network, its guards and the patches.
-        name: of the kind of memory.
+        name: the name of the kind of memory.
         rate: flips in a megabit.
         draw: number of the injection, which also chooses the patch.
-        seed: of the flips.
+        seed: the seed of the flips.
         clean: PSNR in dB of the same patch without faults, with each set of guards.
     """
     image, reference = target.pairs[draw % len(target.pairs)]
@@ -236,7 +236,7 @@ def _curve_row(name: str, draws: Sequence[Injection], kind: str) -> Row:
     those detected.
 
     Args:
-        name: of the row.
+        name: the name of the row.
         draws: the injections, at least one.
         kind: what is counted, such as "draws", for the source of the figures.
     """

@@ -39,7 +39,7 @@ def flip_bits(
     """Return a copy of integers with `count` bits flipped. Signed types are in two's complement.
 
     Args:
-        values: of any shape and integer type that holds them.
+        values: integers of any shape, and of a type that holds them.
         count: the number of different bits to flip.
         generator: draws which bits flip.
         bits: the number of bits of one integer in memory.
@@ -165,7 +165,7 @@ class Guards:
     Attributes:
         relu6: bound in units of each ReLU that has one, by its tensor.
         limit_dn: bound of the correction's magnitude.
-        checksums: of each convolution, by name.
+        checksums: the checksums of each convolution, by name.
     """
 
     relu6: Mapping[str, int]

@@ -140,7 +140,7 @@ def recommend(points: Sequence[Measured], asked: Question) -> tuple[Measured | N
     For a need without a budget, the cheapest point is recommended.
 
     Args:
-        points: of all boards that are compared.
+        points: the points of all boards that are compared.
         asked: budget and need.
 
     Returns:
@@ -239,7 +239,7 @@ def board_rows(
     recommended one; or the reason why it has none.
 
     Args:
-        points: of all boards.
+        points: the points of all boards.
         boards: names, in the order of the rows.
         recommended: None if there is none.
         asked: budget and need.

@@ -39,7 +39,7 @@ class Measured:
     """A point with all its figures.
 
     Attributes:
-        name: of the point, or of a published run as it is printed.
+        name: the name of the point, or of a published run as it is printed.
         figures: by name; unavailable ones have a reason.
         text: the words next to the figures.
         point: None for a published run.
@@ -100,8 +100,8 @@ class Comparison:
     """Compares points by their scores on the same images.
 
     Attributes:
-        sites: of the images, in their order.
-        seed: of the bootstrap.
+        sites: the sites of the images, in their order.
+        seed: the seed of the bootstrap.
     """
 
     sites: Sequence[str]

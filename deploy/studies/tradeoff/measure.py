@@ -48,7 +48,7 @@ class Benchmark:
         reference: sensor of the reference images.
         lpips: weights of SqueezeNet 1.1, or a folder of backbones; None reads the path from the
             environment.
-        seed: of the bootstrap.
+        seed: the seed of the bootstrap.
     """
 
     pairs: Sequence[NamedPair]
@@ -205,8 +205,8 @@ def make_int8(network: Network, scenes: Path | None, sensor: Sensor, seed: int) 
     Args:
         network: in float32.
         scenes: folder of images to calibrate on; drawn ones if None.
-        sensor: of the patches, if the network names no known one.
-        seed: of every random draw.
+        sensor: the sensor of the patches, if the network names no known one.
+        seed: the seed of every random draw.
     """
     named = network.sensor
     calibration_sensor = Sensor.load(named) if named in sensor_names() else sensor

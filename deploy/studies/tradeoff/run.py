@@ -58,14 +58,14 @@ class Study:
     Attributes:
         networks: shipped names, files, or networks in memory; float ones are quantised.
         boards: the boards whose points are compared.
-        sensors: of the degraded and of the reference images.
+        sensors: the sensors of the degraded and of the reference images.
         scenes: folder of held-out scenes; None for drawn ones.
         lpips: weights for LPIPS, or None.
         calibration: folder of scenes to quantise networks on; None for drawn ones.
         size: (width, height) of the swath in pixels.
         budget: upper limits of costs.
         need: limits of quality that must be reached.
-        seed: of every random draw.
+        seed: the seed of every random draw.
     """
 
     networks: Sequence[NetworkLike]
@@ -223,7 +223,7 @@ def weigh(
     """Find the front, the recommendation, and the best point of each board.
 
     Args:
-        points: of all boards, and published runs.
+        points: the points of all boards, and published runs.
         boards: their names.
         asked: budget and need.
         remarks: on the study.
