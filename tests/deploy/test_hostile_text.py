@@ -20,6 +20,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from markdown_it import MarkdownIt
+from rich.cells import cell_len
 from rich.console import Console
 from rich.text import Text
 
@@ -165,7 +166,9 @@ def test_progress_is_one_line_without_markup(text: str) -> None:
     plain_text = io.StringIO()
     Console(file=plain_text, width=10_000).print(Text(one_line(text)), end="")
     shown = plain_text.getvalue().rstrip("\n")
-    assert terminal.getvalue().startswith(shown), "a name in brackets is no markup"
+    # A modifier alone takes no place, and a table leaves it out.
+    is_shown = cell_len(shown) > 0
+    assert not is_shown or terminal.getvalue().startswith(shown), "a name in brackets is no markup"
 
 
 @any_text
