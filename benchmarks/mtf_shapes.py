@@ -3,8 +3,8 @@ different MTF curves.
 
     python benchmarks/mtf_shapes.py --images aerial-test/ [--methods traditional,convbeers-s-int8]
 
-Each curve is given as a table up to Nyquist, where it is 7 %, and all methods receive it. The
-script prints the PSNR of inner pixels against the reference without noise.
+Each curve is given as a table up to Nyquist, where it is 7 % or --contrast, and all methods receive
+it. The script prints the PSNR of inner pixels against the reference without noise.
 """
 
 import argparse
@@ -19,25 +19,25 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import axes_of
 
 FIGURE = "inner PSNR, reference without noise"
-CONTRAST = 0.07
 MIDDLE_CPX = 0.22
 WIDTH_CPX = 0.12
 DEPTH = 0.10
 """The sag and the bulge: middle and width in cycles per pixel, and the change of contrast."""
 
 
-def curves() -> dict[str, Curve]:
+def curves(at_nyquist: float) -> dict[str, Curve]:
     """Return the contrasts of each curve at FREQUENCIES."""
     detector = np.sinc(FREQUENCIES)
-    contrast = CONTRAST / detector[-1]
+    contrast = at_nyquist / detector[-1]
     formula = contrast ** (FREQUENCIES / NYQUIST) * detector
     hill = DEPTH * np.exp(-(((FREQUENCIES - MIDDLE_CPX) / WIDTH_CPX) ** 2))
     return {
         "of training": formula,
-        "Gaussian": CONTRAST ** ((FREQUENCIES / NYQUIST) ** 2),
+        "Gaussian": at_nyquist ** ((FREQUENCIES / NYQUIST) ** 2),
         "sagging": formula * (1 - hill),
         "bulging": formula * (1 + hill),
         "circular pupil": pupil_contrast(contrast, 0.0) * detector,
+        "obscured pupil": pupil_contrast(contrast, 0.3) * detector,
     }
 
 
@@ -46,9 +46,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--images", type=Path, required=True)
     parser.add_argument("--methods", default="traditional,convbeers-s-int8,convbeers-s-curves-int8")
+    parser.add_argument("--contrast", type=float, default=0.07)
+    parser.add_argument("--curves", help="names, separated by commas; all if none")
     arguments = parser.parse_args()
     sensor = Sensor.load("pleiades-degraded")
-    for name, contrasts in curves().items():
+    drawn = curves(arguments.contrast)
+    for name in arguments.curves.split(",") if arguments.curves else drawn:
+        contrasts = drawn[name]
         values = tuple(contrasts.tolist())
         response: Response = MtfTable(tuple(FREQUENCIES.tolist()), values, values)
         table = bd.evaluate(
