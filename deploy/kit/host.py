@@ -203,7 +203,7 @@ def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
     ones = np.ones(BLOCK + 2 * NEAR, F)
     reached = summed(extended((raw >= 1).astype(F), NEAR), ones, ones) > 0
     usable = (~reached).astype(F)
-    share = interpolated(usable, x.shape)
+    share = interpolated(usable, x.shape) if reached.any() else F(1)
     # Where few of the blocks around are usable, the correction fades out.
     change = interpolated(residual * usable, x.shape) / np.maximum(share, F(0.25))
     if S["consistency"]["detail"]:

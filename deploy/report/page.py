@@ -108,18 +108,16 @@ def _grid(table: Section, *, upright: bool) -> dict[str, object]:
         line = [_cell(row.figures.get(column.name)) for column in figures]
         line += [_word(row.text.get(word, "")) for word in words]
         cells.append(line)
-    heads = [_head(row.name) for row in rows]
+    sides = [columns, [_head(row.name) for row in rows]]
     if not upright and len(columns) > max(WIDE, len(rows)):
         # Columns that do not fit on a page are turned into rows, because a page is open downwards.
-        upright_columns = columns
-        columns = heads
-        heads = upright_columns
+        sides.reverse()
         cells = [list(line) for line in zip(*cells, strict=True)]
     return {
         "title": table.title,
         "caption": table.caption,
-        "header": columns,
-        "lines": list(zip(heads, cells, strict=True)),
+        "header": sides[0],
+        "lines": list(zip(sides[1], cells, strict=True)),
         "missing": missing(rows),
     }
 

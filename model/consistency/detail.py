@@ -66,17 +66,12 @@ class DetailStep:
         """Build the step from the separable filters (terms, 2 NEAR_PX + 1) of H's near part."""
         return cls(window_weights(rows, FINE_PX), window_weights(columns, FINE_PX))
 
-    def correction(
-        self, raw: Image, restored: Image, weights: Image, down: Placed, across: Placed
-    ) -> Image:
-        """Compute the correction for the kept pixels.
-
-        It is 0 at the image's border and next to blocks that do not count.
+    def correction(self, raw: Image, restored: Image, down: Placed, across: Placed) -> Image:
+        """Compute the correction for the kept pixels, which is 0 at the image's border.
 
         Args:
             raw: y, the pixels of all blocks of `down` and `across`.
             restored: x, the same with NEAR_PX more on every side.
-            weights: (n, m) 1 for each block of BLOCK_PX that counts, else 0.
             down: where the rows lie, and which are kept.
             across: where the columns lie, likewise.
 
@@ -86,11 +81,9 @@ class DetailStep:
         residual = block_means(raw, FINE_PX) - separable_sums(
             restored, self.rows, self.columns, FINE_PX
         )
-        # The residual of a block that does not count is no noise, and may be NaN.
         means = block_means(residual, BLOCK_PX // FINE_PX)
         change = interpolate(residual, down, across, FINE_PX) - interpolate(means, down, across)
-        counts = interpolate(weights, down, across) * down.inside[:, None] * across.inside
-        return np.where(counts == 1, change, np.float32(0))
+        return np.asarray(change * down.inside[:, None] * across.inside)
 
 
 def window_weights(vectors: NDArray[np.float64], block_px: int) -> Image:

@@ -203,6 +203,7 @@ class Consistency:
         if any_missing:
             missing_pixels = extend(missing.astype(np.float32), (down, across), origin, NEAR_PX)
             weights *= np.float32(1) - reached_blocks(missing_pixels, NEAR_PX)
+        share: Image | None = None
         if weights.all():
             change = interpolate(residual, down, across)
         else:
@@ -210,7 +211,9 @@ class Consistency:
             change = interpolate(residual * weights, down, across)
             change /= np.maximum(share, np.float32(LEAST_SHARE))
         if self.detail is not None:
-            change += self.detail.correction(raw_pixels, near_pixels, weights, down, across)
+            fine = self.detail.correction(raw_pixels, near_pixels, down, across)
+            # Next to a block that does not count the finer residual is no noise, and may be NaN.
+            change += fine if share is None else np.where(share == 1, fine, np.float32(0))
         return change
 
     def _far(

@@ -23,6 +23,7 @@ from beers_deploy.model.io.tensors import (
 )
 from beers_deploy.model.metrics import perceptual
 from beers_deploy.model.shipped import SHIPPED, shipped_names, shipped_weights
+from beers_deploy.model.training.recipe import load_recipe
 from beers_deploy.model.variants import VARIANTS, Variant, variant_named
 from beers_deploy.profiles.errors import MachineError, ModelError, OptionError
 from tests.model.networks import behind_a_bank, plain
@@ -139,7 +140,7 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
 def test_the_shipped_weights_load_and_say_how_they_were_made(name: str) -> None:
     shipped = read_conditioned(shipped_weights(name))
     recipe = shipped.recipe
-    assert shipped.variant == VARIANTS[name.removesuffix("-curves")]
+    assert shipped.variant == VARIANTS[load_recipe(name).variant]
     assert recipe["degraded"] == "drawn over the ranges"
     # Recipes leave out the reference's noise; the command before them had a profile without noise.
     cut = shipped.kernels == "cut"
