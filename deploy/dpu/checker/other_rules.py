@@ -41,7 +41,7 @@ INSTEAD = {
     "Neg": "fold the minus sign into the weights before it",
     "Div": (
         "fold the division into the weights of the convolution before it, or multiply by the "
-        "reciprocal"
+        "reciprocal; in front of Erf it is a part of GELU, which 'quantize --adapt' replaces"
     ),
     "Exp": "leave it to the host, behind the network",
     "Sigmoid": (
