@@ -21,7 +21,6 @@ from beers_deploy.dpu.checker.operators import (
     rule_name,
     rule_text,
 )
-from beers_deploy.dpu.checker.other_rules import INSTEAD
 from beers_deploy.dpu.checker.remarks import REMARKS
 from beers_deploy.dpu.shapes import KINDS, Kind
 from beers_deploy.profiles.shipped import board_names, npu_names
@@ -45,8 +44,8 @@ rule applies to all boards or to those named with it; parentheses have what diff
 
 A node runs on the DPU if it keeps every rule of its kind, the rules of size, and in a quantised file those of numbers. A
 fully connected layer, or a convolution as large as its map, is also judged as a 1 x 1 convolution over the flattened
-map. Other nodes run on the board's processor: `check` fails, and `bench` counts their time at the start and the end of
-a float network, and refuses the network elsewhere.
+map. Other nodes run on the board's processor: `check` fails and names what to use instead of the operator; `bench`
+counts their time at the start and the end of a float network, and refuses the network elsewhere.
 """
 VARYING = re.compile(r"((?<=: )[^.:]+(?=\.)|\d+)")
 """Where the text of a rule may differ between boards: a list up to the end of a sentence, or a
@@ -65,9 +64,7 @@ def document() -> str:
     parts += _rules("Remarks, which break no rule", REMARKS)
     for name in npu_names():
         parts += _npu(device_of(TargetProfile.load(name)))
-    parts += ["## What to use instead\n"]
-    parts += [f"- {names}: {remedy}" for names, remedy in _alike(dict(sorted(INSTEAD.items())))]
-    return "\n".join([*parts, ""])
+    return "\n".join(parts)
 
 
 FIGURES: dict[str, Callable[[Dpu], str]] = {

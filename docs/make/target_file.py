@@ -7,6 +7,7 @@ has.
 
 from collections import defaultdict
 from collections.abc import Iterator
+from itertools import groupby
 from pathlib import Path
 
 from beers_deploy.profiles.constant import Constant
@@ -100,26 +101,37 @@ KEYS: dict[str, dict[str, str]] = {
         "memory_efficiency": "share of `ddr_bytes_per_s` that maps reach",
         "layer_s": "time added to each layer",
         "host_image_s": "time of the host for an image",
-        "host_in_bytes_per_s": "rate of input from the host",
-        "host_out_bytes_per_s": "rate of output to the host",
-        "argmax_values_per_s": "rate of this task on the host",
-        "softmax_values_per_s": "likewise",
-        "sort_values_per_s": "likewise, for boxes and key points",
-        "image_values_per_s": "likewise, for an image",
+        **dict.fromkeys(
+            ("host_in_bytes_per_s", "host_out_bytes_per_s"),
+            "rates of copies between host and DPU",
+        ),
+        **dict.fromkeys(
+            (
+                "argmax_values_per_s",
+                "softmax_values_per_s",
+                "sort_values_per_s",
+                "image_values_per_s",
+            ),
+            "rates of the host's tasks",
+        ),
         "overlap": "share of the shorter of computing and moving that is hidden; assumed",
         "contention_exponent": "how sharply the slower of DPU and host sets the rate",
-        "width_array": "half width of the interval of ln(FPS) as far as the array sets it",
-        "width_lanes": "the same for the ALU and the element-wise engine",
-        "width_memory": "the same for transfers",
-        "width_start": "the same for starts of layers",
-        "width_copies": "the same for the host's copies",
-        "width_task": "the same for the host's task",
-        "width_outside": "the least of it for a network beyond those fitted",
+        **dict.fromkeys(
+            (
+                "width_array",
+                "width_lanes",
+                "width_memory",
+                "width_start",
+                "width_copies",
+                "width_task",
+            ),
+            "half widths of the interval of ln(FPS), by the part of the time",
+        ),
+        "width_outside": "the least of them for a network beyond those fitted",
         "families_held": "share of the families left out that intervals held",
         "error_left_out": "mean error of the networks left out",
         "pair_width": "half width for ln of the ratio of two networks' rates",
-        "fitted_map_bytes": "range of the fitted networks",
-        "fitted_operations": "likewise",
+        **dict.fromkeys(("fitted_map_bytes", "fitted_operations"), "ranges of the fitted networks"),
     },
     "cpu": {
         "cores": "cores of the board's processor",
@@ -192,7 +204,8 @@ def _constants() -> Iterator[str]:
         }
         if table == FITTED:
             yield "Fitted by `python -m benchmarks.cost_model.refit`, where nothing else is said.\n"
-            yield from (f"- `{key}`: {meaning}" for key, meaning in selected.items())
+            for meaning, group in groupby(selected, key=selected.__getitem__):
+                yield f"- {', '.join(f'`{key}`' for key in group)}: {meaning}"
         else:
             yield from (
                 line(key, meaning, constants[table][key]) for key, meaning in selected.items()
