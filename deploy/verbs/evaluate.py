@@ -63,12 +63,10 @@ def evaluate(
 ) -> "Table":
     """Compare restorations with the reference, in the mean and by site.
 
-    PSNR leaves out clipped pixels, inner PSNR also a border of 57 pixels. Of simulated pairs PSNR
-    is also measured against the reference without its noise. MTF and SNR are measured on restored
-    slanted edges and flat fields, the flux of points and the contrast of faint bars and zone plates
-    on targets. With a detector the table has average precision, precision and recall on reference,
-    degraded and restored scenes, with intervals over sites, and the share of the loss that
-    restoration regains.
+    The tables have PSNR, SSIM and LPIPS, MTF and SNR on edges and flat fields, and on targets the
+    flux of points and the contrast of faint detail: docs/explanation/reading-the-numbers.md says
+    how they are measured. With a detector they have average precision, precision and recall, and
+    the share of the loss that restoration regains.
 
     Args:
         methods: names, separated by commas: degraded is always a row. Shipped networks and the

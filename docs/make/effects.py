@@ -15,7 +15,7 @@ from PIL import Image
 from beers_deploy.model.io.pictures import Stretch, strip
 from beers_deploy.model.simulator.acquire import MARGIN_PX, prepare_scene, simulate_planned
 from beers_deploy.model.simulator.detector import Draw
-from beers_deploy.model.simulator.plan import ORDER, TOLERANCE_DN, Plan, make_plan, scene_stats
+from beers_deploy.model.simulator.plan import ORDER, TOLERANCE_DN, make_plan, scene_stats
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles.effects import TABLES, settled
 from beers_deploy.profiles.instrument import Instrument
@@ -104,23 +104,17 @@ def figure() -> Image.Image:
 
 
 def bounds(radiance: np.ndarray) -> Iterator[str]:
-    """Yield the Markdown table of the bounds of the effects that each scene has."""
-    plans = dict[str, Plan]()
+    """Yield a Markdown line for each scene, with the bounds of the effects that it has."""
     for name in scene_names():
         call = SceneCall.load(name)
         sensor = calling_for(Sensor.load("pleiades-degraded"), call).nominal()
-        plans[name] = make_plan(sensor, scene_stats(radiance * call.radiance_scale.low, RATIO))
-    yield f"| effect | {' | '.join(plans)} |"
-    yield "|---" * (len(plans) + 1) + "|"
-    for number, effect in enumerate(
-        decision.effect for decision in next(iter(plans.values())).decisions
-    ):
-        cells = [plan.decisions[number].bound_dn for plan in plans.values()]
-        if any(cells):
-            yield (
-                f"| {effect} | "
-                f"{' | '.join('-' if cell is None else f'{cell:.3g}' for cell in cells)} |"
-            )
+        plan = make_plan(sensor, scene_stats(radiance * call.radiance_scale.low, RATIO))
+        effects = ", ".join(
+            f"{decision.effect} {decision.bound_dn:.3g}"
+            for decision in plan.decisions
+            if decision.bound_dn
+        )
+        yield f"- **{name}**: {effects}"
 
 
 if __name__ == "__main__":
