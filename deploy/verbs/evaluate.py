@@ -79,9 +79,8 @@ def evaluate(
         reference: sensor of the reference images; pleiades-reference if none.
         lpips: weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.
         out: folder for report.html and pictures.
-        calibrate: copy of the network's file to write with the interval that 'restore --interval'
-            uses, fitted on these pairs; `methods` must be that file alone. A level of 90 % needs at
-            least 9 images outside the sites that are fitted.
+        calibrate: copy of the network's file to write, with the interval of 'restore --interval'
+            fitted on these pairs; `methods` must be that file alone.
         sweep: also compare under 16 sensors that are known exactly, and 7 that are known wrongly.
         brightness: also compare with the radiance of the scenes times these factors, such as
             0.25,0.05.

@@ -6,7 +6,6 @@ Run `python docs/make/effects.py` after a change to the simulator.
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -50,8 +49,7 @@ prints for each effect whether a scene gets it, and why.
 ![One crop of a synthetic scene: blur and noise, then each effect added alone, then all](../assets/effects.png)
 
 Every sensor blurs, samples, adds noise and digitises. The other effects, {count} of them, apply when a sensor profile
-or a scene has their table; `profiles/effects.toml` has typical values. In the picture they are stronger, to be seen:
-{shown}.
+or a scene has their table; `profiles/effects.toml` has typical values. In the picture they are stronger, to be seen.
 
 They apply in the order of the signal: one transfer function for MTF, anti-alias filter and smear; sampling; then
 {order}; `veil` is haze. The MTF that a profile states includes the anti-alias filter, but not smear.
@@ -67,12 +65,10 @@ under `pleiades-degraded` have these effects, with these bounds:
 
 def document() -> str:
     """Return the page as Markdown."""
-    parameters = chain.from_iterable(values.items() for values in SHOWN.values())
-    examples = ", ".join(f"{key} {value:g}" for key, value in parameters)
     scene = procedural_scene(1500, 1500, np.random.default_rng(0)).radiance
     order = ", ".join(ORDER[ORDER.index("sampling") + 1 :])
     count = len(TABLES)
-    head = HEAD.format(count=count, order=order, shown=examples, tolerance=TOLERANCE_DN)
+    head = HEAD.format(count=count, order=order, tolerance=TOLERANCE_DN)
     return head + "\n".join(bounds(scene)) + "\n"
 
 

@@ -7,7 +7,6 @@ has.
 
 from collections import defaultdict
 from collections.abc import Iterator
-from itertools import groupby
 from pathlib import Path
 
 from beers_deploy.profiles.constant import Constant
@@ -95,44 +94,36 @@ KEYS: dict[str, dict[str, str]] = {
         "cpu_run_w": "power while the processor runs the traditional pipeline",
     },
     "tile": {"memory_bytes": "memory of the board, into which maps must fit"},
-    FITTED: {
-        "array_efficiency": "share of the peak that convolutions reach",
-        "port_bytes_per_cycle": "rate between a core and the memory",
-        "memory_efficiency": "share of `ddr_bytes_per_s` that maps reach",
-        "layer_s": "time added to each layer",
-        "host_image_s": "time of the host for an image",
-        **dict.fromkeys(
-            ("host_in_bytes_per_s", "host_out_bytes_per_s"),
-            "rates of copies between host and DPU",
+    FITTED: dict.fromkeys(
+        (
+            "array_efficiency",
+            "port_bytes_per_cycle",
+            "memory_efficiency",
+            "layer_s",
+            "host_image_s",
+            "host_in_bytes_per_s",
+            "host_out_bytes_per_s",
+            "argmax_values_per_s",
+            "softmax_values_per_s",
+            "sort_values_per_s",
+            "image_values_per_s",
+            "overlap",
+            "contention_exponent",
+            "width_array",
+            "width_lanes",
+            "width_memory",
+            "width_start",
+            "width_copies",
+            "width_task",
+            "width_outside",
+            "families_held",
+            "error_left_out",
+            "pair_width",
+            "fitted_map_bytes",
+            "fitted_operations",
         ),
-        **dict.fromkeys(
-            (
-                "argmax_values_per_s",
-                "softmax_values_per_s",
-                "sort_values_per_s",
-                "image_values_per_s",
-            ),
-            "rates of the host's tasks",
-        ),
-        "overlap": "share of the shorter of computing and moving that is hidden; assumed",
-        "contention_exponent": "how sharply the slower of DPU and host sets the rate",
-        **dict.fromkeys(
-            (
-                "width_array",
-                "width_lanes",
-                "width_memory",
-                "width_start",
-                "width_copies",
-                "width_task",
-            ),
-            "half widths of the interval of ln(FPS), by the part of the time",
-        ),
-        "width_outside": "the least of them for a network beyond those fitted",
-        "families_held": "share of the families left out that intervals held",
-        "error_left_out": "mean error of the networks left out",
-        "pair_width": "half width for ln of the ratio of two networks' rates",
-        **dict.fromkeys(("fitted_map_bytes", "fitted_operations"), "ranges of the fitted networks"),
-    },
+        "fitted",
+    ),
     "cpu": {
         "cores": "cores of the board's processor",
         "clock_ghz": "its clock",
@@ -142,7 +133,7 @@ KEYS: dict[str, dict[str, str]] = {
         "pipeline_s_per_mpx": "time of the traditional pipeline on all cores",
     },
 }
-"""The meaning of every key, by its table."""
+"""The meaning of every key, by its table; the fitted ones are named only."""
 
 OPENING = """# A board's file
 
@@ -203,9 +194,11 @@ def _constants() -> Iterator[str]:
             key: meaning for key, meaning in keys.items() if table != BUILD or key not in SIZES
         }
         if table == FITTED:
-            yield "Fitted by `python -m benchmarks.cost_model.refit`, where nothing else is said.\n"
-            for meaning, group in groupby(selected, key=selected.__getitem__):
-                yield f"- {', '.join(f'`{key}`' for key in group)}: {meaning}"
+            yield (
+                "The constants of the [cost model](../explanation/cost-model.md), fitted by "
+                "`python -m benchmarks.cost_model.refit`; leave them to your base: "
+                f"{', '.join(f'`{key}`' for key in selected)}."
+            )
         else:
             yield from (
                 line(key, meaning, constants[table][key]) for key, meaning in selected.items()
