@@ -1,17 +1,14 @@
 """Write docs/reference/target-file.md, every key of a board's file: `python
 docs/make/target_file.py`.
 
-The keys, and the values of the shipped boards, are read from their files; meanings stand below. A test keeps the page fresh, and fails for a key that the tables below lack or that no board
+A test keeps the page fresh, and fails for a key that the tables below lack or that no shipped board
 has.
 """
 
-from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-from beers_deploy.profiles.constant import Constant
-from beers_deploy.profiles.shipped import board_names
-from beers_deploy.profiles.target import DOCUMENTS, FUSED, NPU, PLACES, TargetProfile
+from beers_deploy.profiles.target import DOCUMENTS, FUSED, NPU, PLACES
 
 TARGET = Path(__file__).parents[1] / "reference" / "target-file.md"
 BUILD = "configurations.NAME"
@@ -152,28 +149,6 @@ file has its constants, so leave out what your DPU does not limit.
 """
 
 
-def shipped() -> dict[str, dict[str, list[Constant]]]:
-    """Return the constants of every shipped board with a DPU, by table and key."""
-    by_table: dict[str, dict[str, list[Constant]]] = defaultdict(lambda: defaultdict(list))
-    for board in map(TargetProfile.load, board_names()):
-        tables = [
-            *board.tables.items(),
-            *((BUILD, build) for build in board.configurations.values()),
-        ]
-        for table, constants in tables:
-            for key, constant in constants.items():
-                by_table[table][key].append(constant)
-    return by_table
-
-
-def line(key: str, meaning: str, constants: list[Constant]) -> str:
-    """Return the line of a key: its meaning, and the values of the shipped boards."""
-    low = min(c.low for c in constants)
-    high = max(c.high for c in constants)
-    among = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
-    return f"- `{key}`: {meaning} ({among})"
-
-
 def document() -> str:
     """Return the page as Markdown."""
     return "\n".join([OPENING, *_constants(), *_words(), ""])
@@ -182,26 +157,23 @@ def document() -> str:
 def _constants() -> Iterator[str]:
     yield "## Constants\n"
     yield (
-        "Parentheses have the values of the shipped boards. A name ends in its unit; kernels, "
-        "strides and padding are in pixels, shifts in bits. A value out of range is refused with "
-        f"its limits. A configuration may state these keys of other tables for itself: "
-        f"{_names((*SIZES,))}."
+        "A name ends in its unit; kernels, strides and padding are in pixels, shifts in bits. A "
+        "value out of range is refused with its limits. A configuration may state these keys of "
+        f"other tables for itself: {_names((*SIZES,))}."
     )
-    constants = shipped()
     for table, keys in KEYS.items():
         yield f"\n### [{table}]\n"
-        selected = {
-            key: meaning for key, meaning in keys.items() if table != BUILD or key not in SIZES
-        }
         if table == FITTED:
             yield (
                 "The constants of the [cost model](../explanation/cost-model.md), fitted by "
                 "`python -m benchmarks.cost_model.refit`; leave them to your base: "
-                f"{', '.join(f'`{key}`' for key in selected)}."
+                f"{', '.join(f'`{key}`' for key in keys)}."
             )
         else:
             yield from (
-                line(key, meaning, constants[table][key]) for key, meaning in selected.items()
+                f"- `{key}`: {meaning}"
+                for key, meaning in keys.items()
+                if table != BUILD or key not in SIZES
             )
 
 
