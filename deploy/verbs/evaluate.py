@@ -63,12 +63,10 @@ def evaluate(
 ) -> "Table":
     """Compare restorations with the reference, in the mean and by site.
 
-    PSNR leaves out clipped pixels, inner PSNR also a border of 57 pixels. Of simulated pairs PSNR
-    is also measured against the reference without its noise. MTF and SNR are measured on restored
-    slanted edges and flat fields, the flux of points and the contrast of faint bars and zone plates
-    on targets. With a detector the table has average precision, precision and recall on reference,
-    degraded and restored scenes, with intervals over sites, and the share of the loss that
-    restoration regains.
+    The tables have PSNR, SSIM and LPIPS, MTF and SNR on edges and flat fields, and on targets the
+    flux of points and the contrast of faint detail: docs/explanation/reading-the-numbers.md says
+    how they are measured. With a detector they have average precision, precision and recall, and
+    the share of the loss that restoration regains.
 
     Args:
         methods: names, separated by commas: degraded is always a row. Shipped networks and the
@@ -81,9 +79,8 @@ def evaluate(
         reference: sensor of the reference images; pleiades-reference if none.
         lpips: weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.
         out: folder for report.html and pictures.
-        calibrate: copy of the network's file to write with the interval that 'restore --interval'
-            uses, fitted on these pairs; `methods` must be that file alone. A level of 90 % needs at
-            least 9 images outside the sites that are fitted.
+        calibrate: copy of the network's file to write, with the interval of 'restore --interval'
+            fitted on these pairs; `methods` must be that file alone.
         sweep: also compare under 16 sensors that are known exactly, and 7 that are known wrongly.
         brightness: also compare with the radiance of the scenes times these factors, such as
             0.25,0.05.

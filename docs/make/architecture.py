@@ -94,9 +94,8 @@ def chart() -> str:
             "  end",
         ]
     for box in boxes:
-        lines += [
-            f"  {box} --> {other}" for other in sorted(edges.get(box, set()) - beyond(box, edges))
-        ]
+        if others := sorted(edges.get(box, set()) - beyond(box, edges)):
+            lines.append(f"  {box} --> {' & '.join(others)}")
     return "\n".join(["```mermaid", *lines, "```", ""])
 
 

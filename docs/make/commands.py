@@ -35,7 +35,7 @@ and, where it reports figures, `--json`.
 A board is {boards}, or your .toml file ([boards](boards.md)); where nothing is
 predicted also {npus}. A sensor is the name of a profile, or your .toml file ([sensors](sensor-profile.md)).
 """
-SEVERAL = 3
+SEVERAL = 2
 """Commands that have the same line for an option, from which on it is described once."""
 NAMED = ": name or .toml file"
 """How boards and sensors are named, which the opening says once."""
@@ -47,7 +47,8 @@ def reference() -> str:
     counted = Counter[str]()
     for entries in lines.values():
         counted.update(entries.values())
-    once = {line for line, commands in counted.items() if commands >= SEVERAL}
+    options = (line for line in counted if line.startswith("- `-"))
+    once = {line for line in options if counted[line] >= SEVERAL}
     opening = OPENING.format(boards=", ".join(board_names()), npus=", ".join(npu_names()))
     parts = [opening, *sorted(once), ""]
     for name, command in COMMANDS.items():

@@ -6,7 +6,6 @@ Run `python docs/make/effects.py` after a change to the simulator.
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from PIL import Image
 from beers_deploy.model.io.pictures import Stretch, strip
 from beers_deploy.model.simulator.acquire import MARGIN_PX, prepare_scene, simulate_planned
 from beers_deploy.model.simulator.detector import Draw
-from beers_deploy.model.simulator.plan import ORDER, TOLERANCE_DN, Plan, make_plan, scene_stats
+from beers_deploy.model.simulator.plan import ORDER, TOLERANCE_DN, make_plan, scene_stats
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles.effects import TABLES, settled
 from beers_deploy.profiles.instrument import Instrument
@@ -50,8 +49,7 @@ prints for each effect whether a scene gets it, and why.
 ![One crop of a synthetic scene: blur and noise, then each effect added alone, then all](../assets/effects.png)
 
 Every sensor blurs, samples, adds noise and digitises. The other effects, {count} of them, apply when a sensor profile
-or a scene has their table; `profiles/effects.toml` has typical values. In the picture they are stronger, to be seen:
-{shown}.
+or a scene has their table; `profiles/effects.toml` has typical values. In the picture they are stronger, to be seen.
 
 They apply in the order of the signal: one transfer function for MTF, anti-alias filter and smear; sampling; then
 {order}; `veil` is haze. The MTF that a profile states includes the anti-alias filter, but not smear.
@@ -67,12 +65,10 @@ under `pleiades-degraded` have these effects, with these bounds:
 
 def document() -> str:
     """Return the page as Markdown."""
-    parameters = chain.from_iterable(values.items() for values in SHOWN.values())
-    examples = ", ".join(f"{key} {value:g}" for key, value in parameters)
     scene = procedural_scene(1500, 1500, np.random.default_rng(0)).radiance
     order = ", ".join(ORDER[ORDER.index("sampling") + 1 :])
     count = len(TABLES)
-    head = HEAD.format(count=count, order=order, shown=examples, tolerance=TOLERANCE_DN)
+    head = HEAD.format(count=count, order=order, tolerance=TOLERANCE_DN)
     return head + "\n".join(bounds(scene)) + "\n"
 
 
@@ -104,23 +100,17 @@ def figure() -> Image.Image:
 
 
 def bounds(radiance: np.ndarray) -> Iterator[str]:
-    """Yield the Markdown table of the bounds of the effects that each scene has."""
-    plans = dict[str, Plan]()
+    """Yield a Markdown line for each scene, with the bounds of the effects that it has."""
     for name in scene_names():
         call = SceneCall.load(name)
         sensor = calling_for(Sensor.load("pleiades-degraded"), call).nominal()
-        plans[name] = make_plan(sensor, scene_stats(radiance * call.radiance_scale.low, RATIO))
-    yield f"| effect | {' | '.join(plans)} |"
-    yield "|---" * (len(plans) + 1) + "|"
-    for number, effect in enumerate(
-        decision.effect for decision in next(iter(plans.values())).decisions
-    ):
-        cells = [plan.decisions[number].bound_dn for plan in plans.values()]
-        if any(cells):
-            yield (
-                f"| {effect} | "
-                f"{' | '.join('-' if cell is None else f'{cell:.3g}' for cell in cells)} |"
-            )
+        plan = make_plan(sensor, scene_stats(radiance * call.radiance_scale.low, RATIO))
+        effects = ", ".join(
+            f"{decision.effect} {decision.bound_dn:.3g}"
+            for decision in plan.decisions
+            if decision.bound_dn
+        )
+        yield f"- **{name}**: {effects}"
 
 
 if __name__ == "__main__":

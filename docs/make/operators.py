@@ -21,7 +21,6 @@ from beers_deploy.dpu.checker.operators import (
     rule_name,
     rule_text,
 )
-from beers_deploy.dpu.checker.other_rules import INSTEAD
 from beers_deploy.dpu.checker.remarks import REMARKS
 from beers_deploy.dpu.shapes import KINDS, Kind
 from beers_deploy.profiles.shipped import board_names, npu_names
@@ -41,12 +40,13 @@ OPENING = """# Operators of the DPUs
     beers-deploy check network.onnx --target zcu102
 
 applies these rules to your network; `beers-deploy profiles NAME` lists the limits of a board with their sources. A
-rule applies to all boards or to those named with it; parentheses have what differs on the boards named there.
+rule applies to all boards or to those named with it; parentheses have what differs on the boards named there. Limits
+are those of each board's default configuration; a smaller one has lower limits on channels.
 
 A node runs on the DPU if it keeps every rule of its kind, the rules of size, and in a quantised file those of numbers. A
 fully connected layer, or a convolution as large as its map, is also judged as a 1 x 1 convolution over the flattened
-map. Other nodes run on the board's processor: `check` fails, and `bench` counts their time at the start and the end of
-a float network, and refuses the network elsewhere.
+map. Other nodes run on the board's processor: `check` fails and names what to use instead of the operator; `bench`
+counts their time at the start and the end of a float network, and refuses the network elsewhere.
 """
 VARYING = re.compile(r"((?<=: )[^.:]+(?=\.)|\d+)")
 """Where the text of a rule may differ between boards: a list up to the end of a sentence, or a
@@ -56,7 +56,7 @@ number.
 
 def document() -> str:
     """Return the page as Markdown."""
-    parts = [OPENING, *_boards(), *_kinds()]
+    parts = [OPENING, *_kinds()]
     parts += _rules("Sizes, for every node", SIZES)
     parts += _rules(
         "Numbers, in a quantised file",
@@ -65,31 +65,7 @@ def document() -> str:
     parts += _rules("Remarks, which break no rule", REMARKS)
     for name in npu_names():
         parts += _npu(device_of(TargetProfile.load(name)))
-    parts += ["## What to use instead\n"]
-    parts += [f"- {names}: {remedy}" for names, remedy in _alike(dict(sorted(INSTEAD.items())))]
-    return "\n".join([*parts, ""])
-
-
-FIGURES: dict[str, Callable[[Dpu], str]] = {
-    "configuration": lambda dpu: dpu.name,
-    "peak, TOPS": lambda dpu: f"{dpu.constants['peak_tops'].low:g}",
-    "cores": lambda dpu: str(dpu.cores),
-    "images at once": lambda dpu: str(dpu.batch),
-    "input x output channels x pixels": lambda dpu: (
-        f"{dpu.input_parallel} x {dpu.output_parallel} x {dpu.whole('array', 'pixel_parallel')}"
-    ),
-}
-"""What a board's file states, in the words of a table."""
-
-
-def _boards() -> Iterator[str]:
-    yield "## The boards, each with its default configuration\n"
-    yield "A smaller configuration of a DPU has lower limits on channels.\n"
-    yield f"| | {' | '.join(DPUS)} |"
-    yield "|---" * (len(DPUS) + 1) + "|"
-    for title, cell in FIGURES.items():
-        yield f"| {title} | {' | '.join(map(cell, DPUS.values()))} |"
-    yield ""
+    return "\n".join(parts)
 
 
 def _kinds() -> Iterator[str]:

@@ -27,9 +27,9 @@ OPENING = f"""# Stability
 
     beers-deploy stress float.onnx int8.onnx
 
-runs {len(CASES)} hard cases through {len(STAGES)} stages on your own pair; the exit code is 1 when a check exceeds its bound and
-no known limitation explains it up to its ceiling. The figures below are those of the shipped {VARIANT}. `--out` and
-`--json` write all figures with their bounds.
+runs {len(CASES)} hard cases through {len(STAGES)} stages on your own pair ({", ".join(STAGES)}); the exit code is 1 when a check
+exceeds its bound and no known limitation explains it up to its ceiling. The figures below are those of the shipped
+{VARIANT}. `--out` and `--json` write all figures with their bounds.
 """
 
 
@@ -37,9 +37,7 @@ def document(subject: Subject, results: list[StageResult]) -> str:
     """Return the page as Markdown."""
     cases = ["## Cases and stages\n", LEGEND, "", *case_lines(results)]
     findings = ["## What is found\n", *finding_lines(subject, results)]
-    return "\n".join(
-        [OPENING, *findings, "", *stage_lines(), "", *limitation_lines(), "", *cases, ""]
-    )
+    return "\n".join([OPENING, *findings, "", *limitation_lines(), "", *cases, ""])
 
 
 def finding_lines(subject: Subject, results: list[StageResult]) -> Iterator[str]:
@@ -72,13 +70,6 @@ def finding_lines(subject: Subject, results: list[StageResult]) -> Iterator[str]
         f"at most {bits:.1f} of "
         "31 bits, by interval arithmetic on the file's own weights (proven)."
     )
-
-
-def stage_lines() -> Iterator[str]:
-    """Yield a line for each stage, from its docstring."""
-    yield "## Stages\n"
-    for name, look in STAGES.items():
-        yield f"- **{name}**: {(look.__doc__ or '').strip().splitlines()[0]}"
 
 
 def case_lines(results: list[StageResult]) -> Iterator[str]:

@@ -1,17 +1,14 @@
 """Write docs/reference/target-file.md, every key of a board's file: `python
 docs/make/target_file.py`.
 
-The keys, and the values of the shipped boards, are read from their files; meanings stand below. A test keeps the page fresh, and fails for a key that the tables below lack or that no board
+A test keeps the page fresh, and fails for a key that the tables below lack or that no shipped board
 has.
 """
 
-from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-from beers_deploy.profiles.constant import Constant
-from beers_deploy.profiles.shipped import board_names
-from beers_deploy.profiles.target import DOCUMENTS, FUSED, NPU, PLACES, TargetProfile
+from beers_deploy.profiles.target import DOCUMENTS, FUSED, NPU, PLACES
 
 TARGET = Path(__file__).parents[1] / "reference" / "target-file.md"
 BUILD = "configurations.NAME"
@@ -94,33 +91,36 @@ KEYS: dict[str, dict[str, str]] = {
         "cpu_run_w": "power while the processor runs the traditional pipeline",
     },
     "tile": {"memory_bytes": "memory of the board, into which maps must fit"},
-    FITTED: {
-        "array_efficiency": "share of the peak that convolutions reach",
-        "port_bytes_per_cycle": "rate between a core and the memory",
-        "memory_efficiency": "share of `ddr_bytes_per_s` that maps reach",
-        "layer_s": "time added to each layer",
-        "host_image_s": "time of the host for an image",
-        "host_in_bytes_per_s": "rate of input from the host",
-        "host_out_bytes_per_s": "rate of output to the host",
-        "argmax_values_per_s": "rate of this task on the host",
-        "softmax_values_per_s": "likewise",
-        "sort_values_per_s": "likewise, for boxes and key points",
-        "image_values_per_s": "likewise, for an image",
-        "overlap": "share of the shorter of computing and moving that is hidden; assumed",
-        "contention_exponent": "how sharply the slower of DPU and host sets the rate",
-        "width_array": "half width of the interval of ln(FPS) as far as the array sets it",
-        "width_lanes": "the same for the ALU and the element-wise engine",
-        "width_memory": "the same for transfers",
-        "width_start": "the same for starts of layers",
-        "width_copies": "the same for the host's copies",
-        "width_task": "the same for the host's task",
-        "width_outside": "the least of it for a network beyond those fitted",
-        "families_held": "share of the families left out that intervals held",
-        "error_left_out": "mean error of the networks left out",
-        "pair_width": "half width for ln of the ratio of two networks' rates",
-        "fitted_map_bytes": "range of the fitted networks",
-        "fitted_operations": "likewise",
-    },
+    FITTED: dict.fromkeys(
+        (
+            "array_efficiency",
+            "port_bytes_per_cycle",
+            "memory_efficiency",
+            "layer_s",
+            "host_image_s",
+            "host_in_bytes_per_s",
+            "host_out_bytes_per_s",
+            "argmax_values_per_s",
+            "softmax_values_per_s",
+            "sort_values_per_s",
+            "image_values_per_s",
+            "overlap",
+            "contention_exponent",
+            "width_array",
+            "width_lanes",
+            "width_memory",
+            "width_start",
+            "width_copies",
+            "width_task",
+            "width_outside",
+            "families_held",
+            "error_left_out",
+            "pair_width",
+            "fitted_map_bytes",
+            "fitted_operations",
+        ),
+        "fitted",
+    ),
     "cpu": {
         "cores": "cores of the board's processor",
         "clock_ghz": "its clock",
@@ -130,7 +130,7 @@ KEYS: dict[str, dict[str, str]] = {
         "pipeline_s_per_mpx": "time of the traditional pipeline on all cores",
     },
 }
-"""The meaning of every key, by its table."""
+"""The meaning of every key, by its table; the fitted ones are named only."""
 
 OPENING = """# A board's file
 
@@ -149,28 +149,6 @@ file has its constants, so leave out what your DPU does not limit.
 """
 
 
-def shipped() -> dict[str, dict[str, list[Constant]]]:
-    """Return the constants of every shipped board with a DPU, by table and key."""
-    by_table: dict[str, dict[str, list[Constant]]] = defaultdict(lambda: defaultdict(list))
-    for board in map(TargetProfile.load, board_names()):
-        tables = [
-            *board.tables.items(),
-            *((BUILD, build) for build in board.configurations.values()),
-        ]
-        for table, constants in tables:
-            for key, constant in constants.items():
-                by_table[table][key].append(constant)
-    return by_table
-
-
-def line(key: str, meaning: str, constants: list[Constant]) -> str:
-    """Return the line of a key: its meaning, and the values of the shipped boards."""
-    low = min(c.low for c in constants)
-    high = max(c.high for c in constants)
-    among = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
-    return f"- `{key}`: {meaning} ({among})"
-
-
 def document() -> str:
     """Return the page as Markdown."""
     return "\n".join([OPENING, *_constants(), *_words(), ""])
@@ -179,23 +157,23 @@ def document() -> str:
 def _constants() -> Iterator[str]:
     yield "## Constants\n"
     yield (
-        "Parentheses have the values of the shipped boards. A name ends in its unit; kernels, "
-        "strides and padding are in pixels, shifts in bits. A value out of range is refused with "
-        f"its limits. A configuration may state these keys of other tables for itself: "
-        f"{_names((*SIZES,))}."
+        "A name ends in its unit; kernels, strides and padding are in pixels, shifts in bits. A "
+        "value out of range is refused with its limits. A configuration may state these keys of "
+        f"other tables for itself: {_names((*SIZES,))}."
     )
-    constants = shipped()
     for table, keys in KEYS.items():
         yield f"\n### [{table}]\n"
-        selected = {
-            key: meaning for key, meaning in keys.items() if table != BUILD or key not in SIZES
-        }
         if table == FITTED:
-            yield "Fitted by `python -m benchmarks.cost_model.refit`, where nothing else is said.\n"
-            yield from (f"- `{key}`: {meaning}" for key, meaning in selected.items())
+            yield (
+                "The constants of the [cost model](../explanation/cost-model.md), fitted by "
+                "`python -m benchmarks.cost_model.refit`; leave them to your base: "
+                f"{', '.join(f'`{key}`' for key in keys)}."
+            )
         else:
             yield from (
-                line(key, meaning, constants[table][key]) for key, meaning in selected.items()
+                f"- `{key}`: {meaning}"
+                for key, meaning in keys.items()
+                if table != BUILD or key not in SIZES
             )
 
 

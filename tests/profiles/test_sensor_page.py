@@ -3,16 +3,12 @@
 import math
 import re
 import tomllib
-from itertools import chain
 from pathlib import Path
 from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
-from typer.core import TyperGroup
-from typer.main import get_command
 
-from beers_deploy.cli.commands import app
 from beers_deploy.profiles.constant import Constant, Status
 from beers_deploy.profiles.effects import TABLES as EFFECTS
 from beers_deploy.profiles.instrument import MTF_NYQUIST_MAX
@@ -99,24 +95,3 @@ def test_profiles_print_the_file_to_start_from(tmp_path: Path) -> None:
         assert done("profiles", tmp_path / "mine.toml", "--toml") == printed
         if name in sensor_names():
             assert same_instrument(Sensor.load(str(tmp_path / "mine.toml")), Sensor.load(name))
-
-
-def test_the_pages_commands_are_understood_and_use_what_was_written_before() -> None:
-    """Read by the command line itself, not run; each input is the page's own, the user's, or an
-    earlier output.
-    """
-    (block,) = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
-    group = get_command(app)
-    files = {"scene.png", "raw.tif", "my-sensor.toml"}
-    assert isinstance(group, TyperGroup)
-    lines = [line.split()[1:] for line in block.splitlines()]
-    for name, *words in lines:
-        context = group.commands[name].make_context(name, [*words])
-        parts = chain.from_iterable(word.split(",") for word in words)
-        paths = {part for part in parts if re.search(r"\.(png|tif|toml|onnx)$", part)}
-        outputs = {str(context.params.get(key)) for key in ("out", "output", "board_file")} & {
-            *words
-        }
-        assert paths - outputs <= files, (name, paths - outputs - files)
-        files |= outputs
-    assert [name for name, *_ in lines].count("restore") == 2

@@ -1,10 +1,9 @@
-"""Write docs/explanation/mutations.md: `python docs/make/mutations.py` breaks a copy of this code
-ten times.
+"""Break a copy of this code ten times, and print which stability tests notice.
 
-It takes some minutes. Each time one or two lines of the product change, as
-docs/explanation/mutations.toml says, and the files of stability tests that it names run on the
-copy. The tests named there must fail; unbroken, every one must pass. Exit code 1 when a broken
-version survives. A test keeps the list true to the code.
+Run `python -m tests.stability.mutations` from the repository root; it takes some minutes. Each time
+one or two lines of the product change, as mutations.toml says, and the files of stability tests
+that it names run on the copy. The tests named there must fail; unbroken, every one must pass. The
+exit code is 1 if a broken version survives. A test keeps the list true to the code.
 """
 
 import os
@@ -23,8 +22,7 @@ from shutil import copyfile
 from beers_deploy.model.progress import steps
 
 ROOT = Path(__file__).resolve().parents[2]
-LIST = ROOT / "docs" / "explanation" / "mutations.toml"
-TARGET = ROOT / "docs" / "explanation" / "mutations.md"
+LIST = Path(__file__).with_name("mutations.toml")
 SUITE = "tests/stability"
 PROBE_FILE = "test_copy.py"
 FAILED = re.compile(r"^(?:FAILED|ERROR) \S+/(\w+\.py::\w+)", re.MULTILINE)
@@ -35,7 +33,8 @@ from beers_deploy import model, profiles, quant
 
 def test_the_copy_is_what_runs():
     here = Path(__file__).resolve().parents[2]
-    assert {Path(each.__file__).resolve().parents[1] for each in (beers_deploy, model, profiles, quant)} == {here}
+    modules = (beers_deploy, model, profiles, quant)
+    assert {Path(each.__file__).resolve().parents[1] for each in modules} == {here}
 """
 
 Failures = Mapping[str, int]
@@ -44,7 +43,7 @@ Failures = Mapping[str, int]
 
 @dataclass(frozen=True)
 class Mutation:
-    """One way to break the product, see docs/explanation/mutations.toml."""
+    """One way to break the product, see mutations.toml."""
 
     name: str
     meaning: str
@@ -56,15 +55,6 @@ class Mutation:
 MUTATIONS = tuple(
     Mutation(**entry) for entry in tomllib.loads(LIST.read_text(encoding="utf-8"))["mutation"]
 )
-
-OPENING = """# Broken on purpose
-
-    python docs/make/mutations.py
-
-makes ten copies of this code, changes one or two lines of each as [mutations.toml](mutations.toml) says, and runs
-stability tests on them. Every test passes on the unchanged code. The table names the tests of `tests/stability` that
-failed for each change, with the number of cases in parentheses.
-"""
 
 
 def broken(text: str, mutation: Mutation) -> str:
@@ -89,7 +79,7 @@ def repository_copy() -> Iterator[Path]:
     that the copy is what runs.
     """
     command = ["git", "ls-files", "-co", "--exclude-standard", "-z"]
-    listed = subprocess.check_output(command, cwd=ROOT, text=True)  # noqa: S603 - the developer's own git
+    listed = subprocess.check_output(command, cwd=ROOT, text=True)
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder).resolve()
         for name in filter(None, listed.split("\0")):
@@ -125,7 +115,7 @@ def failures(copy: Path) -> Failures:
     files = {name.partition("::")[0] for name in names}
     paths = [f"{SUITE}/{name}" for name in sorted({PROBE_FILE, *files})]
     options = ["-n0", "-pno:cacheprovider", "--tb=no", "-q", "-rfE", "--hypothesis-seed=0"]
-    process = subprocess.run(  # noqa: S603
+    process = subprocess.run(
         [sys.executable, "-m", "pytest", *paths, *options],
         cwd=copy,
         env={**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"},
@@ -141,38 +131,25 @@ def failures(copy: Path) -> Failures:
     return tests
 
 
-def document(failures_by: Mapping[str, Failures]) -> str:
-    """Return the page as Markdown."""
-    lines = [OPENING, "| mutation | file | tests that fail |", "|---|---|---|"]
-    for mutation in MUTATIONS:
-        tests = ", ".join(
-            f"`{name}` ({cases})" for name, cases in failures_by[mutation.name].items()
-        )
-        lines.append(f"| {described(mutation)} | {tests or 'none'} |")
-    return "\n".join([*lines, ""])
-
-
-def described(mutation: Mutation) -> str:
-    """Return the two cells that describe the change."""
-    return f"**{mutation.name}**: {mutation.meaning} | `{mutation.file}`"
+def summary(mutation: Mutation, failing: Failures) -> str:
+    """Return one line on a mutation: its name, and the tests that failed with their cases."""
+    tests = ", ".join(f"{name} ({cases})" for name, cases in failing.items())
+    verdict = "SURVIVED" if set(mutation.tests) - set(failing) else "noticed"
+    return f"{verdict}: {mutation.name}: {tests or 'no test fails'}"
 
 
 def main() -> int:
-    """Run all mutations, write the page, and print those that survived."""
-    by_mutation = {}
+    """Run all mutations, print what noticed each, and return 1 if one survived."""
+    lines = []
     with repository_copy() as copy, steps("breaking", len(MUTATIONS) + 1) as bar:
         if failing := failures(copy):
             raise SystemExit(f"unbroken, these fail: {', '.join(failing)}")
         bar.advance()
         for mutation in MUTATIONS:
-            by_mutation[mutation.name] = failures_of(copy, mutation)
+            lines.append(summary(mutation, failures_of(copy, mutation)))
             bar.advance(note=mutation.name)
-    TARGET.write_text(document(by_mutation), encoding="utf-8", newline="\n")
-    print(f"wrote {TARGET}")
-    survivors = [m.name for m in MUTATIONS if set(m.tests) - set(by_mutation[m.name])]
-    for name in survivors:
-        print(f"SURVIVED: {name}")
-    return 1 if survivors else 0
+    sys.stdout.write("\n".join([*lines, ""]))
+    return int(any(line.startswith("SURVIVED") for line in lines))
 
 
 if __name__ == "__main__":
