@@ -8,7 +8,7 @@ The script prints three tables, measured on simulated acquisitions of the images
    of the sweep: the number of blocks, of decidable ones, and of those outside the bound.
 2. A file for another sensor, whose MTF at Nyquist is 30 % too low or too high.
 3. Single bit flips in the weights of INT8 networks: the share that is found of those that cost a
-   block more than 0.5 dB, by the block's sharpening.
+   block more than 0.5 dB, and of these blocks by their sharpening.
 """
 
 import argparse
@@ -38,6 +38,8 @@ RADIANCES = (1.0, 0.25, 0.05)
 COSTLY_DB = 0.5
 CLASSES = (0, 10, 20, 30, 40, 60, 100, np.inf)
 """The limits of the classes of sharpening in the tables."""
+LOSSES_DB = (COSTLY_DB, 1, 2, 5, np.inf)
+"""The limits of the classes of a block's loss."""
 PEAK_DN = 4095
 
 NOMINAL = Sensor.load("pleiades-degraded")
@@ -75,12 +77,16 @@ def flat(parts: list[Judged]) -> Judged:
 
 def by_class(blocks: Judged) -> str:
     """Return the share of blocks outside the bound, by class of sharpening."""
+    return shares(blocks.outside, blocks.sharpening, CLASSES)
+
+
+def shares(outside: np.ndarray, values: np.ndarray, limits: tuple[float, ...]) -> str:
+    """Return the share of blocks outside the bound, by class of a value of each block."""
     words = []
-    for low, high in pairwise(CLASSES):
-        inside = (blocks.sharpening >= low) & (blocks.sharpening < high)
+    for low, high in pairwise(limits):
+        inside = (values >= low) & (values < high)
         if inside.any():
-            share = blocks.outside[inside].mean()
-            words.append(f"{low:g}-{high:g}: {share:.1%} of {inside.sum()}")
+            words.append(f"{low:g}-{high:g}: {outside[inside].mean():.1%} of {inside.sum()}")
     return ", ".join(words)
 
 
@@ -135,8 +141,10 @@ def flips(images: Path, name: str, count: int, seed: int) -> str:
     core = read_core(network.model)
     pairs = pairs_at(images, sensor, 1.0, seed)
     sound = network_method(network.model, PEAK_DN, {}, sensor, reference)
-    # A row for each flip: the blocks that it costs too much, and those of them that are found.
-    counts = np.zeros((count, 2), int)
+    hurt_blocks = []
+    losses_db = []
+    costly = 0
+    detected = 0
     before: dict[int, np.ndarray] = {}
     for draw in range(count):
         generator = np.random.default_rng([seed, draw])
@@ -148,16 +156,24 @@ def flips(images: Path, name: str, count: int, seed: int) -> str:
             before[number] = block_db(sound(pair.degraded), pair.noise_free)
         restored = network_method(model, PEAK_DN, {}, sensor, reference)(pair.degraded)
         loss_db = before[number] - block_db(restored, pair.noise_free)
+        if not (loss_db > COSTLY_DB).any():
+            continue
         blocks = judged(check, pair.degraded, restored)
         rows, columns = loss_db.shape
-        whole = np.s_[:rows, :columns]
-        hurt = (loss_db > COSTLY_DB) & blocks.decidable[whole] & np.isfinite(blocks.chi2[whole])
-        counts[draw] = hurt.sum(), (hurt & blocks.outside[whole]).sum()
-    costly, detected = counts.sum(0)
-    costly_flips, detected_flips = (counts > 0).sum(0)
+        chi2 = blocks.chi2[:rows, :columns]
+        is_hurt = (loss_db > COSTLY_DB) & np.isfinite(chi2)
+        hurt = Judged(chi2[is_hurt], blocks.sharpening[:rows, :columns][is_hurt])
+        hurt_blocks.append(hurt)
+        losses_db.append(loss_db[is_hurt])
+        costly += bool(hurt.decidable.any())
+        detected += bool((hurt.decidable & hurt.outside).any())
+    hurt = flat(hurt_blocks)
+    decidable = hurt.decidable
+    by_loss = shares(hurt.outside[decidable], np.concatenate(losses_db)[decidable], LOSSES_DB)
     return (
-        f"{name}: {count} flips, {costly_flips} cost a decidable block more than {COSTLY_DB:g} dB, "
-        f"{detected_flips} of them found; {detected} of {costly} such blocks"
+        f"{name}: {count} flips, {costly} cost a decidable block more than {COSTLY_DB:g} dB, "
+        f"{detected} of them found; by the loss of decidable blocks in dB: {by_loss}; by the "
+        f"sharpening of all blocks that lose as much: {by_class(hurt)}"
     )
 
 
