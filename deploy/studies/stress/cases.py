@@ -22,7 +22,11 @@ Draw = Callable[[int, np.random.Generator], list[np.ndarray]]
 
 
 def flat(*levels: float) -> Draw:
-    """Return a function that draws constant images (side, side) at these shares of full scale."""
+    """Return a function that draws constant images (side, side), one for each level.
+
+    Args:
+        levels: the brightness of each image as a share of full scale.
+    """
     return lambda side, _: [_filled(side, level * FULL_DN) for level in levels]
 
 
@@ -105,7 +109,9 @@ def noisy(side: int, generator: np.random.Generator) -> list[np.ndarray]:
 
 
 def through(mtf_nyquist: float) -> Draw:
-    """Return a function that draws a ground with the given MTF at Nyquist, without noise."""
+    """Return a function that draws one image (side, side): a ground seen through an instrument
+    with the given MTF at Nyquist (a share), without noise.
+    """
     return lambda side, generator: [ground(side, generator, mtf_nyquist)]
 
 
@@ -118,7 +124,9 @@ def stripes(side: int, generator: np.random.Generator) -> list[np.ndarray]:
 
 
 def scattered(value: float) -> Draw:
-    """Return a function that draws a ground in which 2 % of the pixels have this value."""
+    """Return a function that draws one image (side, side): a ground in which 2 % of the pixels have
+    the given value.
+    """
 
     def draw(side: int, generator: np.random.Generator) -> list[np.ndarray]:
         image = ground(side, generator)
@@ -129,8 +137,8 @@ def scattered(value: float) -> Draw:
 
 
 def sized(*shapes: tuple[int, int]) -> Draw:
-    """Return a function that cuts parts of these shapes from one drawn ground, independent of the
-    side.
+    """Return a function that cuts images of the given shapes (H, W) from one drawn ground. The side
+    that it is called with has no effect.
     """
 
     def draw(_: int, generator: np.random.Generator) -> list[np.ndarray]:
@@ -141,7 +149,7 @@ def sized(*shapes: tuple[int, int]) -> Draw:
 
 
 def narrow(_: int, __: np.random.Generator) -> list[np.ndarray]:
-    """Return a row (1, 97) and a column (97, 1) at half of full scale."""
+    """Draw an image of one row, (1, 97), and one of one column, (97, 1), at half of full scale."""
     row = np.full((1, 97), FULL_DN // 2, np.float32)
     return [row, row.T.copy()]
 
@@ -173,14 +181,16 @@ def _digital(image: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Case:
-    """One kind of hard image.
+    """A hard case: a kind of image that is difficult for a network.
 
     Attributes:
-        name: short, as in the tables.
-        draw: draws its images.
-        pixels: "sound", or the fault of the pixels: "missing" (NaN), "infinite", "beyond" 12 bits.
-        flat: True if every pixel of an image is the same, so that the mean must be preserved.
-        large: True if only the checks of one run are made.
+        name: the short name in tables.
+        draw: the function that draws the images of the case, given a side in pixels and a random
+            generator.
+        pixels: "sound" if all pixels are valid, or the fault of some: "missing" (NaN), "infinite",
+            or "beyond" 12 bits.
+        flat: True if all pixels of an image are equal, so that the mean must be preserved.
+        large: True if the image is so large that only the checks of a single run are made.
     """
 
     name: str
