@@ -50,12 +50,13 @@ def interval_of(network: Network) -> PixelInterval:
 @dataclass(frozen=True)
 class HalfWidths:
     """The half-widths of the intervals of all restored pixels, computed row by row on request, in
-    the form that `write_raster` reads.
+    the form that `write_raster` reads. The error of a pixel stays within its half-width with a
+    stated probability.
 
     Attributes:
         source: the raw image, which states the missing pixels.
         restored: returns restored rows (rows, width), given the band, the first row and the end.
-        bands: for each band, the function of the restored pixels that returns their half-widths.
+        bands: for each band, the formula that computes half-widths from restored pixels.
     """
 
     source: Source
@@ -90,7 +91,7 @@ class HalfWidths:
 
 
 def half_widths_of(work: Restoration, level: Level) -> tuple[HalfWidth, ...]:
-    """Build, for each band of an image, the function that returns the half-widths of its pixels.
+    """Build, for each band of an image, the formula that computes the half-widths of its pixels.
 
     Args:
         work: the restoration of the image, before its first row.

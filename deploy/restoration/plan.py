@@ -192,7 +192,9 @@ class Plan:
 
     @property
     def groups(self) -> int:
-        """The number of groups of bands that the network restores jointly."""
+        """The number of groups of bands: 1 if the network restores all bands jointly, else one
+        group for each band.
+        """
         return self.bands // self.tiling.channels_in
 
     @property
@@ -228,7 +230,7 @@ class Plan:
 
     @property
     def tiles(self) -> int:
-        """The number of tiles of the image, each of which is one run of the network."""
+        """The number of tiles of the image, over all groups of bands."""
         return len(self.rows) * self.row_tiles
 
     @property

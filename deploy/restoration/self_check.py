@@ -124,7 +124,8 @@ class BlockMap:
 def checks_of(
     sensors: Mapping[str, Sensor], raster: Raster, out_shape: Sequence[int], full_scale: float
 ) -> dict[int, SelfCheck]:
-    """Build the self-check of each band whose sensor is known.
+    """Build the self-check of each band whose sensor is known. It compares the restored image,
+    blurred as the sensor blurs, with the raw image.
 
     Args:
         sensors: the sensor by the name of the band; a sensor for all bands has the key "".

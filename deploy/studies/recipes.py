@@ -54,6 +54,10 @@ def make_network(
         out: the output folder, with a folder for each stage.
         resume: True to continue the run in the folder; otherwise it must contain no run.
         device: the device of torch, 'cpu' or 'cuda'.
+
+    Raises:
+        OptionError: the folder contains a run, or one that cannot be continued with this recipe.
+        ModelError: the training diverges, or weights do not fit the recipe.
     """
     weights = shipped_weights(recipe.start) if recipe.start else None
     for number, stage in enumerate(recipe.stages, 1):

@@ -54,7 +54,11 @@ class Fault:
 
 @dataclass(frozen=True)
 class FaultList:
-    """The faults of an image's detectors, sorted and without duplicates."""
+    """The list of an image's faulty detectors, as a file states it or as they were detected.
+
+    Attributes:
+        faults: the faults, sorted and without duplicates; empty for none.
+    """
 
     faults: tuple[Fault, ...]
 
@@ -107,7 +111,7 @@ class FaultList:
 
 
 def counted(count: int, name: str) -> str:
-    """Return a count and a noun, which gets an "s" unless the count is 1."""
+    """Return a count and a noun, such as "3 pixels". The noun has an "s" if the count exceeds 1."""
     return f"{count} {name}{'s' if count > 1 else ''}"
 
 

@@ -58,7 +58,7 @@ def faults_of(source: Source, source_name: str, name: str) -> FaultList:
 
     Raises:
         OptionError: the list cannot be read, or does not fit the image.
-        ImageError: more than 1 % of the pixels look faulty one by one.
+        ImageError: more than 1 % of the pixels look faulty as single pixels.
     """
     if not source_name:
         return FaultList(())
@@ -97,7 +97,7 @@ def find_faults(source: Source, name: str) -> FaultList:
         The faults. A pixel of a faulty column or row is not listed again.
 
     Raises:
-        ImageError: more than 1 % of the pixels look faulty one by one.
+        ImageError: more than 1 % of the pixels look faulty as single pixels.
     """
     raster = source.raster
     lines = set[Fault]()

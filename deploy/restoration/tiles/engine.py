@@ -147,7 +147,7 @@ class Restorer:
     def finish(
         self, strip: Strip, restored: np.ndarray, at: tuple[int, int], place: TilePlace
     ) -> Tile:
-        """Apply the consistency step and store the retained pixels of a tile.
+        """Apply the consistency step to a tile, and convert its pixels to the output's type.
 
         Args:
             strip: the raw rows around the tile, as `read` returns them.

@@ -316,7 +316,21 @@ def restore_dn(
 ) -> np.ndarray:
     """Restore an image of one band in memory, to integers in float32.
 
-    The pixels are those that `restore` writes for an image of integers. Arguments and errors are
-    those of `restore_floats`.
+    The pixels are those that `restore` writes for an image of integers.
+
+    Args:
+        dn: digital numbers (H, W) of 0 to `max_dn`. NaN is a missing pixel, and stays NaN.
+        network: the network ready to run, with versions for higher exposures or without.
+        plan: how the image is cut into tiles.
+        max_dn: the largest digital number, which is 1.0 to the network; by default that of 12 bits.
+        consistency: the step that makes the result agree with the raw image at low spatial
+            frequencies, as a tuple of one; empty to omit it.
+
+    Returns:
+        Restored digital numbers (H, W), whole numbers in float32.
+
+    Raises:
+        ModelError: the network returns another number of bands or another size than the image's.
+        ImageError: a value is below 0 or above `max_dn`.
     """
     return np.asarray(np.rint(restore_floats(dn, network, plan, max_dn, consistency)))

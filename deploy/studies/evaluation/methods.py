@@ -68,8 +68,8 @@ class Method:
         name: the name in tables.
         restore: the function from degraded to restored digital numbers, (H, W) each.
         sensor_known: what the method knows of the sensor, in words: known, blind or another one.
-        specialise: returns the same method for another sensor; None if the method does not depend
-            on a sensor, or always assumes the same one.
+        specialise: returns the function `restore` of the same method for another sensor; None if
+            the method does not depend on a sensor, or always assumes the same one.
     """
 
     name: str
@@ -192,7 +192,8 @@ def network_restore(
 
     Args:
         network: the network, float or INT8.
-        sensor: the sensor of the images. If it is the unknown one, the consistency step is omitted.
+        sensor: the sensor of the images. The sensor named "blind" is unknown, and the consistency
+            step is then omitted.
         reference: the sensor that the restoration aims at.
         around: the steps that are used: exposures, at which dark parts are multiplied by a factor
             before the network, and the consistency step, which makes the result agree with the raw

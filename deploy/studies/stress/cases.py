@@ -58,7 +58,7 @@ def hot_pixel(side: int, _: np.random.Generator) -> list[np.ndarray]:
 
 
 def dead_lines(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """Draw a ground with a column and a row at 0: one image (side, side)."""
+    """Draw a landscape (`ground`) with a column and a row at 0: one image (side, side)."""
     image = ground(side, generator)
     image[:, side // 3] = 0
     image[side // 2] = 0
@@ -103,20 +103,22 @@ def star(side: int, _: np.random.Generator) -> list[np.ndarray]:
 
 
 def noisy(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """Draw a ground at a signal-to-noise ratio of 3: one image (side, side)."""
+    """Draw a landscape (`ground`) at a signal-to-noise ratio of 3: one image (side, side)."""
     clean = ground(side, generator)
     return [_digital(clean * (1 + generator.standard_normal(clean.shape) / 3))]
 
 
 def through(mtf_nyquist: float) -> Draw:
-    """Return a function that draws one image (side, side): a ground seen through an instrument
-    with the given MTF at Nyquist (a share), without noise.
+    """Return a function that draws one image (side, side): a landscape (`ground`) seen through an
+    instrument with the given MTF at Nyquist (a share), without noise.
     """
     return lambda side, generator: [ground(side, generator, mtf_nyquist)]
 
 
 def stripes(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """Draw a ground that lacks every seventh column and one row (NaN): one image (side, side)."""
+    """Draw a landscape (`ground`) that lacks every seventh column and one row (NaN): one image
+    (side, side).
+    """
     image = ground(side, generator)
     image[:, 3::7] = np.nan
     image[side // 4] = np.nan
@@ -124,8 +126,8 @@ def stripes(side: int, generator: np.random.Generator) -> list[np.ndarray]:
 
 
 def scattered(value: float) -> Draw:
-    """Return a function that draws one image (side, side): a ground in which 2 % of the pixels have
-    the given value.
+    """Return a function that draws one image (side, side): a landscape (`ground`) in which 2 % of
+    the pixels have the given value.
     """
 
     def draw(side: int, generator: np.random.Generator) -> list[np.ndarray]:
@@ -137,8 +139,8 @@ def scattered(value: float) -> Draw:
 
 
 def sized(*shapes: tuple[int, int]) -> Draw:
-    """Return a function that cuts images of the given shapes (H, W) from one drawn ground. The side
-    that it is called with has no effect.
+    """Return a function that cuts images of the given shapes (H, W) from one drawn landscape
+    (`ground`). The side that it is called with has no effect.
     """
 
     def draw(_: int, generator: np.random.Generator) -> list[np.ndarray]:
@@ -155,8 +157,15 @@ def narrow(_: int, __: np.random.Generator) -> list[np.ndarray]:
 
 
 def ground(side: int, generator: np.random.Generator, mtf_nyquist: float = DRAWN_MTF) -> np.ndarray:
-    """Draw rectangles of all sizes and brightnesses, seen through an MTF: (side, side), integers of
-    0 to 4095.
+    """Draw a landscape of rectangles of all sizes and brightnesses, as an instrument sees it.
+
+    Args:
+        side: the side of the image in pixels.
+        generator: draws the rectangles.
+        mtf_nyquist: the instrument's MTF at Nyquist, a share; by default that of a sharp one.
+
+    Returns:
+        An image (side, side) of integers of 0 to 4095, float32, without noise.
     """
     image = _filled(side, generator.uniform(800, 1600))
     for _ in range(40):

@@ -54,7 +54,9 @@ def out_of_range(image: np.ndarray) -> Measure:
 
 
 def differing(check: str, image: np.ndarray, other: np.ndarray) -> Measure:
-    """Count the pixels of two images (H, W) that differ in any bit. NaN equals NaN."""
+    """Count the pixels of two images (H, W) that differ in any bit, as the check named `check`. NaN
+    equals NaN.
+    """
     # NaN differs from itself, and a missing pixel is the same in both.
     same = (image == other) | (np.isnan(image) & np.isnan(other))
     return Measure(check, float((~same).sum()), 0, "px")

@@ -134,7 +134,7 @@ def with_ops(core: IntCore, others: Iterable[IntConv]) -> IntCore:
 
 
 def map_channels(core: IntCore) -> dict[str, int]:
-    """Return the number of channels of every tensor that the core reads or writes."""
+    """Return the number of channels of every tensor of an integer core, by the tensor's name."""
     return channels_of(core.ops, {PLANES: core.host_part.planes})
 
 
@@ -174,7 +174,7 @@ class Guards:
     checksums of its weights.
 
     Attributes:
-        relu6: the upper bound of a ReLU's output in int8, by the name of its tensor; not of all.
+        relu6: the upper bounds of ReLUs' outputs in int8, by the tensor's name; some have none.
         limit_dn: the largest magnitude, in DN, of the correction that the network adds to an image.
         checksums: the CRC-32 of the weights and bias of each convolution, by the convolution's
             name.

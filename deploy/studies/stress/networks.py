@@ -325,10 +325,10 @@ def restoration(
 def reference(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
     """Check the INT8 network by the integer reference, layer by layer.
 
-    The runtime must agree with it bit for bit, no accumulator may exceed its proven bound, and only
-    layers whose bounds allow it may saturate. Rounding ties up, as a DPU does, may change the
-    result by at most ROUNDING_DN. Images (H, W) are cropped to CROP_PX, because the reference is
-    slow.
+    The reference computes the integers of each layer in NumPy. The runtime must agree with it bit
+    for bit, no accumulator may exceed its proven bound, and only layers whose bounds allow it may
+    saturate. Rounding ties up, as a DPU does, may change the result by at most ROUNDING_DN. Images
+    (H, W) in DN are cropped to CROP_PX, because the reference is slow.
     """
     core = subject.core
     network = subject.quantized
@@ -367,7 +367,8 @@ def _fractions(image: np.ndarray) -> np.ndarray:
 def tiling(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
     """Compare both networks, tiled by several plans, with the whole image (H, W).
 
-    Each plan must refuse pixels that are infinite or beyond 12 bits.
+    The tiles must give the result of the whole image, bit for bit. If the pixels of the case are
+    infinite or beyond 12 bits, the networks must refuse the image in tiles too.
     """
     measures = []
     cores_px = (LARGE_CORE_PX,) if case.large else CORES_PX

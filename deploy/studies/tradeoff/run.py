@@ -155,6 +155,9 @@ def points_for(study: Study, quantize: Callable[[Network], Network]) -> list[Poi
 def run_tradeoff(study: Study) -> Tradeoff:
     """Measure the quality of every operating point of a study, predict its time on the boards, and
     recommend one point.
+
+    Raises:
+        BeersError: a network or an image cannot be loaded, or a network does not fit the study.
     """
     # The digests are those of the files that are measured.
     inputs = study.inputs
