@@ -94,7 +94,7 @@ def restore_file(
         output: the files to write, and whether an earlier run is continued.
         reading: how the pixels of the image are interpreted.
         load: returns the pipeline that restores the image, a network or the traditional one. It is
-            called once the image and the output are accepted, because loading takes long.
+            called once the image and the output are accepted.
 
     Raises:
         OptionError: an option does not fit the image, the network or an earlier run.
@@ -189,7 +189,7 @@ def _write_interval(
 
 
 def _inputs(work: Restoration) -> list[Input]:
-    """Return the networks that a result rests on, with the band of each if there are several."""
+    """Return the networks as inputs of the table of results; each of several names its band."""
     if len(work.networks) < 2:
         return [network.input for network in work.networks]
     # The user may name the bands in another order than that of the image and of the networks.
@@ -359,7 +359,9 @@ def _row(
     faults: FaultList,
     more: dict[str, Figure],
 ) -> Row:
-    """Return the figures of one run, of which `done_px` rows were finished before, and `more`."""
+    """Return the row of results of one run, with the figures `more`. The throughput counts only the
+    rows after the first `done_px`, which an earlier run finished.
+    """
     raster = work.source.raster
     left = 1 - done_px / checkpoint.shape[1]
     useful_px = prod(raster.shape) * left

@@ -154,8 +154,8 @@ def _href(file: Path, item: Path) -> str:
 
 
 def _corners(file: Any) -> list[tuple[float, float]]:
-    """Longitude and latitude of the four corners of the first and last pixels, in degrees,
-    counter-clockwise.
+    """Return longitude and latitude, in degrees, of the four corners of an open image,
+    counter-clockwise from the upper left one.
     """
     places = [(0, 0), (0, file.height), (file.width, file.height), (file.width, 0)]
     a, b, c, d, e, f = file.transform[:6]

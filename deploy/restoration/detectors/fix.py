@@ -270,8 +270,8 @@ def replace_pixels(
 def _nearest(
     plane: np.ndarray, sound: np.ndarray, places: np.ndarray, side: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the value of the nearest valid pixel to one side of each place, and its distance,
-    which is inf if there is none.
+    """Return the value of the nearest valid pixel to one side of each of n places, (n,), and its
+    distance in steps, (n,), which is inf if there is none.
     """
     values = np.zeros(len(places))
     distances = np.full(len(places), np.inf)

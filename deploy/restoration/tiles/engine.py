@@ -231,8 +231,8 @@ class Restorer:
         return self._bands(place), down, across
 
     def _missing(self, strip: Strip, place: TilePlace) -> np.ndarray | None:
-        """Return a mask of the retained pixels that are missing, of the restored shape, or None if
-        there are none.
+        """Return a mask of the restored pixels of a tile that are missing, (bands, h, w), or None
+        if the strip has none.
 
         If a network computes other bands from several, a pixel is missing if it is missing in any
         of them.

@@ -90,7 +90,9 @@ class ExposedNetwork:
         return Exposed(pixels, len(factors), int((choice > 1).sum()))
 
     def _at(self, factor: int, image: np.ndarray, full_scale: float) -> np.ndarray:
-        """Restore the image at one factor, and return its own pixel values: (1, h, w)."""
+        """Restore an image (h, w) at one factor, and return its pixels, (1, h, w), divided by the
+        factor again.
+        """
         if factor == 1:
             return restore_window(image[None], self.infers[1], full_scale)
         offset = np.float32(self.offset)

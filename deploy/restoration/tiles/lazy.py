@@ -127,11 +127,11 @@ def _finish(
     """Store the retained pixels (bands, h, w) of one tile.
 
     Args:
-        restorer: the restorer of its band.
-        strip: its raw pixels.
-        around: the results of `_tile` for the tiles within reach, in rows.
-        at: row and column of the first pixel of these.
-        place: the tile.
+        restorer: the restorer of the tile's bands.
+        strip: the raw pixels of the tile.
+        around: the results of `_tile` for the tile and those within reach, row by row.
+        at: the row and column of the image at which `around` begins.
+        place: the group of bands, rows and columns of the tile.
     """
     return restorer.finish(strip, np.block(around), at, place._replace(group=0)).pixels
 

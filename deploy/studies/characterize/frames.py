@@ -132,11 +132,11 @@ class _Look:
     """Statistics of the stored values of one frame.
 
     Attributes:
-        step: largest number that divides all values.
+        step: the largest integer that divides all values.
         largest: the largest value.
-        piled: True if pixels accumulate there, as they do only at full scale.
-        darkest: value of the darkest pixels.
-        middle: median.
+        piled: True if pixels accumulate at the largest value, as they do only at full scale.
+        darkest: the value of the darkest pixels.
+        middle: the median of the values.
     """
 
     step: int

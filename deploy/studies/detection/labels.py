@@ -49,8 +49,14 @@ class LabelledSet(NamedTuple):
 
 
 class _File(NamedTuple):
-    """The labels of one image. `size_px` is the height and width that they were made for, or 0 if
-    they state none.
+    """The labels of one image.
+
+    Attributes:
+        image: the path of the image.
+        source: the path of the file of the labels.
+        boxes: the labelled boxes.
+        size_px: the height and width of the image for which the labels were made; 0 if they state
+            no size.
     """
 
     image: Path

@@ -192,7 +192,7 @@ def _compared(
 
 
 def _in_order(rows: Iterable[Row]) -> list[Row]:
-    """Return the rows by table: means, targets, sites, images; with the sites' means among them."""
+    """Sort rows by table: means, targets, sites, images. The rows of sites are computed here."""
     tables = by_table(rows)
     means = [table for name, table in tables.items() if name.startswith("mean")]
     images = [table for name, table in tables.items() if name.startswith("images")]

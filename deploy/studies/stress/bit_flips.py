@@ -202,8 +202,8 @@ def _quality_db(
 
     Args:
         injected: the network and the patch after an injection.
-        guards: the clamps that are in use; None for none.
-        reference: (1, 1, H, W) in [0, 1].
+        guards: the bounds that are applied; None applies none.
+        reference: the reference image of the patch, (1, 1, H, W) in [0, 1].
     """
     return psnr_db(faults.restored(injected, guards), reference, 1.0)
 

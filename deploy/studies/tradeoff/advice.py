@@ -244,7 +244,7 @@ def affordable(
 
 
 def _violation(point: Measured, constraints: Sequence[Constraint]) -> float:
-    """Return the largest violation of a constraint by a point."""
+    """Return by how much a point misses the constraint that it misses most; 0 if it complies."""
     return max((constraint.violation(point) for constraint in constraints), default=0.0)
 
 

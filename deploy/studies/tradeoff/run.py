@@ -286,7 +286,7 @@ def _measured(
     benchmark: Benchmark,
     swath: Swath,
 ) -> list[Measured]:
-    """Return every point with its figures."""
+    """Measure quality and time here of every point, and predict its figures on the board."""
     methods = _methods([point.variant for point in points], benchmark)
     results = list[Measured]()
     # Points of several boards may cut the images alike.
