@@ -33,15 +33,26 @@ from beers_deploy.restoration.tiles.rows import gathered
 def restore_array(
     image: Any, reading: Reading, load: Callable[[], Pipeline], level: Level | None = None
 ) -> Any:
-    """Restore an array of any kind, and return the same kind; with a level also its half-widths.
+    """Restore an array of NumPy, torch, Dask or xarray in memory.
 
     Args:
-        image: (H, W) or (bands, H, W). Arrays of NumPy (masked or not) and torch are restored at
-            once; for Dask the result is lazy. An xarray.DataArray retains coordinates and
-            attributes.
-        reading: how its pixels are interpreted.
-        load: returns the pipeline that restores it.
-        level: the level of the interval whose half-widths are returned too; None for none.
+        image: the raw pixels, (H, W) or (bands, H, W). Arrays of NumPy (masked or not) and torch
+            are restored at once; for Dask the result is lazy. An xarray.DataArray retains
+            coordinates and attributes.
+        reading: how the pixels are interpreted.
+        load: returns the pipeline that restores the image, a network or the traditional one. It is
+            called once the image is accepted.
+        level: the level, in percent, of an interval of each restored pixel; None for no interval.
+
+    Returns:
+        The restored pixels, in an array of the same kind. With a level, the pair of these and the
+        half-widths of the intervals, float32.
+
+    Raises:
+        ImageError: the array has another shape or type, was restored before, or has an implausible
+            result.
+        OptionError: an option does not fit the image, or the array is lazy and the options need its
+            pixels.
     """
     # Arrays of xarray and torch are recognised by their attributes, so that neither is imported.
     if hasattr(image, "coords") and hasattr(image, "dims"):

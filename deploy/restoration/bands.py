@@ -23,11 +23,18 @@ Each = TypeVar("Each")
 
 
 def sensors_of(sensor: SensorLike | Mapping[str, Sensor]) -> dict[str, Sensor]:
-    """Return the sensor of each band by the band's name, or under "" if one sensor is for all
-    bands.
+    """Load the sensors that a user names for an image.
 
     Args:
-        sensor: one for all bands, a mapping, or BAND=PROFILE,BAND=PROFILE.
+        sensor: one sensor for all bands (a `Sensor`, a name or the path of a profile), a mapping
+            from the band's name to its sensor, or a text BAND=PROFILE,BAND=PROFILE.
+
+    Returns:
+        The sensor of each band by the band's name, or one under the key "" for all bands.
+
+    Raises:
+        OptionError: the text lacks a band or a profile, or names a band twice.
+        BeersError: a profile cannot be loaded.
     """
     if isinstance(sensor, Mapping):
         return dict(sensor)
@@ -45,19 +52,27 @@ def sensors_of(sensor: SensorLike | Mapping[str, Sensor]) -> dict[str, Sensor]:
 
 
 def is_unknown(sensors: Mapping[str, Sensor]) -> bool:
-    """Return True if one sensor is for all bands, and it is unknown."""
+    """Return True if the user names no sensor, so that the profile "blind" stands for all bands.
+
+    Args:
+        sensors: the sensor by the name of the band; a sensor for all bands has the key "".
+    """
     return list(sensors) == [""] and sensors[""].name == BLIND
 
 
 def networks_of(
     network: NetworkLike | None, sensors: Mapping[str, Sensor], full_scale: float | None
 ) -> dict[str, Network]:
-    """Return a network for each sensor, by the name of the band, and log which it is.
+    """Load a network for each sensor, and log which network restores.
 
     Args:
-        network: for all bands; the default one if None.
-        sensors: by band, or one under "".
-        full_scale: the value that the user states, or None.
+        network: the network for all bands, which is conditioned on each sensor in turn; None for
+            the default network.
+        sensors: the sensor by the name of the band; a sensor for all bands has the key "".
+        full_scale: the pixel value that is full scale if the user states it, else None.
+
+    Returns:
+        The networks with the same keys as `sensors`.
 
     Raises:
         OptionError: there are several sensors for a network that was made for one, or sensors of
@@ -99,8 +114,19 @@ def _log_network(network: Network, sensors: Mapping[str, Sensor]) -> None:
 
 
 def in_order(items: Mapping[str, Each], raster: Raster) -> list[Each]:
-    """Return items by band in the order of the image's bands. An item for all bands is returned
-    alone.
+    """Sort sensors, networks or other items in the order of the image's bands.
+
+    Args:
+        items: an item for each band by the name of the band, or one for all bands under "".
+        raster: the description of the image, which may name its bands. If it does not, items are
+            sorted by the number at the end of their names, or stay in the given order.
+
+    Returns:
+        One item for each band of the image, or the only item for all bands.
+
+    Raises:
+        OptionError: the names are not those of the image's bands, or there is another number of
+            them.
     """
     if "" in items:
         return [items[""]]
@@ -126,7 +152,12 @@ def _by_number(names: Collection[str]) -> Collection[str]:
 
 
 def require_alike(networks: Sequence[Network]) -> None:
-    """Raise an error if one tiling plan cannot serve the networks of several bands."""
+    """Raise ModelError if an image cannot be cut into the same tiles for all networks of its bands.
+
+    Args:
+        networks: one network for all bands, which is accepted, or one for each. Several must read
+            one band each and have the same receptive radius, stride and scale.
+    """
     tilings = [network.tiling for network in networks]
     if len(networks) > 1 and (len(set(map(repr, tilings))) > 1 or tilings[0].channels_in != 1):
         raise ModelError(

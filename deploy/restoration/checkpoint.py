@@ -34,13 +34,13 @@ ROWS_FILES = ("journal.json", "journal.new", "rows.raw")
 
 @dataclass(frozen=True)
 class FinishedRow:
-    """One row of tiles that is stored.
+    """The journal's entry on one restored row of tiles whose pixels are on the disk.
 
     Attributes:
-        rows_px: rows of pixels, the same for each band.
-        size_bytes: the size of the pixels of all bands.
-        sha256: hex digest of these bytes, band after band.
-        tally: the statistics of these pixels.
+        rows_px: the height of the row of tiles in pixels, the same for each band.
+        size_bytes: the size of the pixels of all bands in bytes.
+        sha256: the hex digest of these bytes, band after band.
+        tally: counts and sums over these pixels and their raw ones.
     """
 
     rows_px: int
@@ -50,10 +50,10 @@ class FinishedRow:
 
 
 def journal_text(job: Mapping[str, object], finished: Sequence[FinishedRow]) -> str:
-    """Return the content of a journal.
+    """Return the JSON text of a journal, the file by which a later run knows the finished rows.
 
     Args:
-        job: all parameters that determine the pixels.
+        job: all parameters that determine the pixels, by name.
         finished: the stored rows of tiles, from the top.
     """
     content = {
@@ -77,15 +77,19 @@ def _digest(content: Mapping[str, object]) -> str:
 
 
 class Checkpoint:
-    """The finished rows of a restored image (bands, height, width), from the top, and a journal of
-    their digests.
+    """The finished rows of a restored image on the disk, from the top, and a journal of their
+    digests, from which a later run continues.
 
     Attributes:
-        rows: the number of finished rows.
-        tally: their statistics.
-        job: all parameters that determine the pixels.
-        damaged_rows: the number of rows of an earlier run that no longer match its journal, and of
-            those below them.
+        out: the path of the restored image, next to which the rows are stored.
+        shape: the shape of the restored image, (bands, height, width).
+        dtype: the type of its pixels.
+        folder: the folder of the rows and the journal.
+        rows: the number of finished rows of pixels.
+        tally: counts and sums over the finished rows and their raw pixels.
+        job: all parameters that determine the pixels, by name.
+        damaged_rows: the number of rows of pixels that an earlier run finished and that are
+            restored again, because they, or rows above them, no longer match the journal.
     """
 
     def __init__(
@@ -101,15 +105,19 @@ class Checkpoint:
         """Start a checkpoint, or continue the one of an earlier run.
 
         Args:
-            out: the image to write in the end.
-            shape: (bands, height, width).
+            out: the path of the image to write in the end.
+            shape: the shape of the restored image, (bands, height, width).
             dtype: the dtype of the pixels.
-            job: all parameters that determine the pixels; a run is resumed only by one of the same
-                job.
-            resume: continue an earlier run; start if there is none.
+            job: all parameters that determine the pixels, by name; a run is resumed only by one of
+                the same job.
+            resume: True to continue an earlier run, and to start if there is none.
             cog_bytes: disk space that the output needs in addition to the rows and the plain TIFF.
             row_ends: the row of pixels at which each row of tiles ends; a journal of other rows is
-                refused.
+                refused. Empty accepts any rows.
+
+        Raises:
+            OptionError: an earlier run was of another job, or its journal is damaged.
+            MachineError: the disk is too full or cannot be written.
         """
         self.out = out
         self.shape = shape
@@ -166,8 +174,10 @@ class Checkpoint:
             self._write_journal()
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
-        """Read finished rows `start` to `stop` (excluded) of one band, (rows, width) as they will
-        be written.
+        """Read finished rows `start` to `stop` (excluded) of one band from the disk.
+
+        Returns:
+            The pixels (rows, width) in the type of the output.
         """
         count = (stop - start) * self.shape[2]
         pixels = np.fromfile(
@@ -186,7 +196,9 @@ class Checkpoint:
 
     @contextmanager
     def disk(self) -> Iterator[None]:
-        """Convert an OSError of the disk within to one sentence for the user."""
+        """Raise MachineError instead of an OSError, such as of a full disk, within the context. Its
+        message tells the user how to continue.
+        """
         try:
             yield
         except OSError as error:
@@ -196,7 +208,9 @@ class Checkpoint:
             ) from error
 
     def _left(self) -> list[FinishedRow]:
-        """Return the rows of tiles that an earlier run of this job finished, by its journal."""
+        """Return the rows of tiles that an earlier run finished, as its journal states. Raise
+        OptionError if the journal is damaged or of another job.
+        """
         path = self.folder / "journal.json"
         if not path.is_file():
             return []
@@ -233,8 +247,8 @@ class Checkpoint:
         return matching
 
     def _stored(self, top: int, rows_px: int) -> tuple[int, str]:
-        """Return the size in bytes and the digest of stored rows of pixels. The size is smaller if
-        the file ends before.
+        """Return the size in bytes and the digest of `rows_px` stored rows from row `top` on. The
+        size is smaller than that of the rows if the file ends before them.
         """
         size_bytes = 0
         digest = hashlib.sha256()
@@ -281,7 +295,10 @@ class Checkpoint:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make a renaming in `folder` durable. Not every system can."""
+    """Flush the entries of a folder to the disk, so that a renaming in it survives a power cut.
+
+    Systems that cannot flush a folder, such as Windows, skip this.
+    """
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

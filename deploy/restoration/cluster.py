@@ -29,10 +29,10 @@ T = TypeVar("T")
 
 
 class Cluster:
-    """The workers that are connected to a scheduler.
+    """The workers that are connected to a Dask scheduler.
 
     Attributes:
-        pool: an executor of `concurrent.futures` whose calls run on them.
+        pool: an executor of `concurrent.futures` whose calls run on the workers.
     """
 
     def __init__(self, client: Any) -> None:
@@ -42,22 +42,42 @@ class Cluster:
 
     @property
     def slots(self) -> int:
-        """The number of calls that run at once: the threads of all workers."""
+        """The number of calls that run at once: the threads of all workers.
+
+        Raises:
+            MachineError: the connection to the scheduler is lost.
+        """
         try:
             return sum(self._client.nthreads().values())
         except OSError as error:
             raise _cluster_error(UNCONNECTED, "Start it again") from error
 
     def share(self, value: T) -> T:
-        """Return a future that stands for a value in calls. The value is sent once, and again if
-        all workers that had it died.
+        """Send a value to the workers once, for use in many calls.
+
+        The scheduler sends the value again if all workers that had it died.
+
+        Args:
+            value: any value that can be pickled.
+
+        Returns:
+            A future of Dask. A call of `pool` that is given this future as an argument receives the
+            value.
         """
         # A call that is given this future receives its result.
         standing: T = self._client.submit(_itself, value, pure=False)
         return standing
 
     def result(self, call: "Future[T]") -> T:
-        """Wait for a call and return its result."""
+        """Wait for a call on the workers, and return its result.
+
+        Args:
+            call: a future that `pool` returned.
+
+        Raises:
+            MachineError: there has been no worker for `WORKERLESS_S` seconds, or the connection to
+                the scheduler is lost.
+        """
         seen_s = time.monotonic()
         while True:
             try:
@@ -77,7 +97,20 @@ def _itself(value: T) -> T:
 
 @contextmanager
 def open_cluster(scheduler: str | None) -> Iterator[Cluster | None]:
-    """Yield the workers of a scheduler, given its address, or None if no address is given."""
+    """Connect to the workers of a Dask scheduler for as long as a run needs them.
+
+    Args:
+        scheduler: the address of the scheduler; None uses no workers.
+
+    Yields:
+        The workers, or None without an address.
+
+    Raises:
+        MachineError: the scheduler does not answer, has no workers, or workers have other versions
+            of the packages that determine the result; or, within the context, the connection is
+            lost or several workers die during the same call.
+        MissingExtraError: the package distributed is not installed.
+    """
     if scheduler is None:
         yield None
         return
@@ -123,8 +156,9 @@ def _connect(distributed: Any, address: str) -> Any:
 
 
 def _require_same_versions(client: Any) -> None:
-    """Raise an error unless every worker has our versions. The function that asks is plain Python,
-    because one of ours would kill a worker without our package.
+    """Raise MachineError unless every worker has the versions of this process. The function that
+    is sent to them is of Python's standard library, because a function of this package would kill a
+    worker that lacks the package.
     """
     for package in PACKAGES:
         here = version(package)

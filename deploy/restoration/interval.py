@@ -29,10 +29,13 @@ ROWS_PX = 32
 
 
 def interval_of(network: Network) -> PixelInterval:
-    """Read the calibrated interval of a network.
+    """Read from a network's file how far its restored pixels may be from the truth.
+
+    Returns:
+        The calibrated interval, which states a half-width for each sensor and level.
 
     Raises:
-        ModelError: a network without one, or a damaged one.
+        ModelError: the network has no calibrated interval, or a damaged one.
     """
     text = metadata(network.model).get(INTERVAL)
     if text is None:
@@ -46,12 +49,14 @@ def interval_of(network: Network) -> PixelInterval:
 
 @dataclass(frozen=True)
 class HalfWidths:
-    """The half-widths of a restored image, as `write_raster` reads them.
+    """The half-widths of the intervals of all restored pixels, computed row by row on request, in
+    the form that `write_raster` reads. The error of a pixel stays within its half-width with a
+    stated probability.
 
     Attributes:
-        source: the raw image, which tells the missing pixels.
-        restored: returns restored rows.
-        bands: the half-width of each band.
+        source: the raw image, which states the missing pixels.
+        restored: returns restored rows (rows, width), given the band, the first row and the end.
+        bands: for each band, the formula that computes half-widths from restored pixels.
     """
 
     source: Source
@@ -59,8 +64,10 @@ class HalfWidths:
     bands: tuple[HalfWidth, ...]
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
-        """Return half-widths of rows `start` to `stop` (excluded), (rows, width) float32, NaN
-        where a pixel is missing.
+        """Return the half-widths of rows `start` to `stop` (excluded) of one band.
+
+        Returns:
+            Half-widths in pixel values, (rows, width) float32, NaN where a pixel is missing.
         """
         parts = [
             self._strip(band, start + top, start + bottom)
@@ -69,7 +76,7 @@ class HalfWidths:
         return np.concatenate(parts)
 
     def read_mask(self, start: int, stop: int) -> np.ndarray:
-        """Return the rows of the mask of the image; missing half-widths are NaN in addition."""
+        """Return rows `start` to `stop` (excluded) of the mask of the raw image, (rows, width)."""
         return self.source.read_mask(start, stop)
 
     def _strip(self, band: int, start: int, stop: int) -> np.ndarray:
@@ -84,16 +91,16 @@ class HalfWidths:
 
 
 def half_widths_of(work: Restoration, level: Level) -> tuple[HalfWidth, ...]:
-    """Build the half-width of each band of a restoration.
+    """Build, for each band of an image, the formula that computes the half-widths of its pixels.
 
     Args:
-        work: the restoration, ready.
-        level: the share of pixels within the interval, in percent.
+        work: the restoration of the image, before its first row.
+        level: the share of pixels whose error lies within the interval, in percent.
 
     Raises:
-        OptionError: a band of an unknown sensor, a network that gives other pixels, or a level
-            that was not calibrated.
-        ModelError: a network without a calibrated interval.
+        OptionError: the sensor of a band is unknown, the network does not return one pixel of the
+            same band for each pixel, or the network has no interval of this level.
+        ModelError: the network has no calibrated interval.
     """
     raster = work.source.raster
     if tuple(work.out_shape) != raster.shape:
@@ -117,15 +124,24 @@ def half_widths_of(work: Restoration, level: Level) -> tuple[HalfWidth, ...]:
 
 
 def interval_beside(out: Path) -> Path:
-    """Return the path of the file of half-widths of a restored image."""
+    """Return the path of the half-widths of a restored image: NAME-interval.tif next to `out`."""
     return out.with_name(f"{out.stem}-interval.tif")
 
 
 def write_half_widths(
     path: Path, widths: HalfWidths, level: Level, compression: Compression
 ) -> None:
-    """Write half-widths as a GeoTIFF of float32 with one plane for each band, NaN where a pixel is
-    missing, in the units and at the place of the restored image.
+    """Write the half-widths of an image as a GeoTIFF of float32 with one plane for each band.
+
+    They have the units and the place on Earth of the restored image, and are NaN where a pixel is
+    missing.
+
+    Args:
+        path: the path of the GeoTIFF.
+        widths: the half-widths of all pixels.
+        level: the share of pixels whose error lies within the interval, in percent; it is recorded
+            with each band.
+        compression: the compression of the GeoTIFF.
     """
     raster = widths.source.raster
     infos = raster.band_info or (BandInfo(),) * raster.bands

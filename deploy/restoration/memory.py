@@ -19,13 +19,19 @@ FLOAT_BYTES = np.dtype(np.float32).itemsize
 
 
 def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
-    """Estimate the memory that rows of the image will need in addition to what is used now.
+    """Estimate the bytes of memory that the rows in work need, in addition to the memory that the
+    process uses now.
 
-    There are three strips as read: two in work and one being read. There are three rows of tiles in
-    float32, as the network returned them: one waits for the row below it, and one more is started.
-    Add two finished rows and the memory of the source. Once the run has `begun`, the first strip
-    and the source's share are already allocated. If pixels may be missing, each has a flag, and one
-    more while flags are computed.
+    At its peak a run holds three strips of raw rows, two in work and one being read; three rows of
+    tiles in float32, as the network returned them; two finished rows of tiles in the type of the
+    output; and the memory in which the image is decoded. If pixels may be missing, each raw pixel
+    has a flag of a byte, and one more while flags are computed.
+
+    Args:
+        source: the image.
+        plan: how the image is cut into tiles.
+        begun: True if the run has read its first strip, so that this strip and the memory for
+            decoding are part of the memory in use.
     """
     raster = source.raster
     row_px = raster.bands * raster.width_px
@@ -40,14 +46,15 @@ def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
 
 
 def check_memory(rows: int, budget_bytes: int | None) -> int:
-    """Return the process's peak memory in bytes: what it uses now, plus the rows to come.
+    """Return the peak memory that this process will reach, in bytes: the resident memory that it
+    uses now, plus the memory for rows of the image.
 
     Args:
-        rows: bytes that rows of the image will need.
-        budget_bytes: None allows all free memory.
+        rows: the bytes that rows of the image will need, as `rows_bytes` estimates them.
+        budget_bytes: the memory that the process may use; None allows all free memory.
 
     Raises:
-        MachineError: the peak exceeds the budget.
+        MachineError: the peak exceeds the memory that is allowed.
     """
     resident_bytes = psutil.Process().memory_info().rss
     # What this process holds already is not part of what is free.

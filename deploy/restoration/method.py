@@ -31,17 +31,26 @@ def network_method(
     reference: Instrument | None = None,
     plan_of: Callable[[tuple[int, ...]], Plan] | None = None,
 ) -> Restore:
-    """Build a method that maps digital numbers of 0 to `max_dn` to integers, as `restore` writes
-    them.
+    """Build a function that restores an image in memory by a network and the steps around it, to
+    the same pixels that `restore` writes.
 
     Args:
         model: the network.
-        max_dn: the largest digital number.
-        brighter: the same network for sensors of higher gain, by factor; empty to omit exposure.
-        sensor: the sensor that acquired the images; None omits the consistency step.
-        reference: the sensor that the restoration aims at; needed with `sensor`.
-        plan_of: returns the tiles of an image (H, W); the default ones, or those that the network
-            is fixed to, if None.
+        max_dn: the largest digital number, which is 1.0 to the network.
+        brighter: the same network for sensors of higher gain, by the factor of the gain. They
+            restore dark parts of an image; empty to omit that.
+        sensor: the sensor that acquired the images; None omits the consistency step, which makes
+            the result agree with the raw image at low spatial frequencies.
+        reference: the sensor that the restoration aims at; None omits the consistency step, too.
+        plan_of: returns the tiles of an image, given its shape (H, W). If None, tiles have the
+            default size, or the size that the network is fixed to.
+
+    Returns:
+        A function from digital numbers (H, W) float32 of 0 to `max_dn` to restored digital numbers
+        of the same shape, whole numbers in float32.
+
+    Raises:
+        ModelError: the network cannot be opened, or cannot be applied to tiles.
     """
     infer, _ = open_runtime("onnxruntime", model, threads=0)
     tiling = tiling_of(model)

@@ -52,30 +52,33 @@ LEAST_SPREAD = 1e-6
 
 @dataclass(frozen=True)
 class Tally:
-    """Counts and sums over an image and its result, without missing pixels.
+    """Counts and sums over raw pixels and their results, the restored pixels, without missing ones.
 
-    Values are shares of full scale.
+    There is one tally for each tile; the sum of two is the tally of both parts of the image. Pixel
+    values are shares of full scale.
 
     Attributes:
         valid_results: number of results that are not missing.
-        clipped: number of pixels of the image above full scale.
-        at_ends: number of results at 0 or at full scale where the image lies between.
-        compared: number of pixels of the image in the sums; 0 if the network returns other bands.
-        before: sum of these pixels.
-        before_squared: sum of their squares.
+        clipped: number of raw pixels above full scale.
+        at_ends: number of results at 0 or at full scale where the raw pixel lies between.
+        compared: number of raw pixels in the sums; 0 if the network returns other bands.
+        before: sum of the raw pixels, clipped to full scale.
+        before_squared: sum of the squares of these raw pixels.
         after: sum of the results.
-        after_squared: sum of their squares.
+        after_squared: sum of the squares of the results.
         tiles: number of tiles that the network was run on.
-        runs: number of runs of the network, one for each exposure of a tile.
-        brightened: number of results that were restored at an exposure above 1.
-        change_squared: sum of the squared changes of the consistency step.
-        network_at_ends: `at_ends` of the network's results. The consistency step would hide a
-            network that does not fit, since it gives nearly any image the mean and the coarse
-            structure of the raw one.
-        network_after: `after` of the network's results.
-        network_after_squared: `after_squared` of the network's results.
-        dark: number of pixels of the image that noise may take to 0.
-        blank: number of pixels of the image in squares of 8 x 8 that are exactly 0.
+        runs: number of runs of the network. A tile needs several if dark parts of it are multiplied
+            by a factor above 1 before the network (an exposure).
+        brightened: number of results that were restored at a factor above 1.
+        change_squared: sum of the squared changes by the consistency step, which makes the
+            network's results agree with the raw image at low spatial frequencies.
+        network_at_ends: `at_ends` before the consistency step. The step would hide a network that
+            does not fit, since it gives nearly any image the mean and the coarse structure of the
+            raw one.
+        network_after: `after` before the consistency step.
+        network_after_squared: `after_squared` before the consistency step.
+        dark: number of raw pixels that noise may take to 0.
+        blank: number of raw pixels in squares of 8 x 8 that are exactly 0.
     """
 
     valid_results: int = 0
@@ -104,13 +107,14 @@ class Tally:
         valid: np.ndarray | None,
         valid_restored: np.ndarray | None,
     ) -> "Tally":
-        """Return counts and sums over the pixels of a part of an image that are not missing.
+        """Compute the tally of a part of an image, from its raw and restored pixels.
 
         Args:
             stored: the raw pixels (bands, h, w), in shares of full scale.
-            restored: the restored pixels (bands', h s, w s), where s is the network's scale.
-            valid: mask of the pixels that are not missing; None if none is missing.
-            valid_restored: mask of the results that are not missing; None if none is missing.
+            restored: the restored pixels (bands', h s, w s), in shares of full scale, where s is
+                the network's scale.
+            valid: mask of the raw pixels that are not missing; None if none is missing.
+            valid_restored: mask of the restored pixels that are not missing; None if none is.
         """
         alike = len(stored) == len(restored)
         between = (stored > 0) & (stored < 1)
@@ -144,11 +148,11 @@ class Tally:
         )
 
     def changed_from(self, network: "Tally", change_squared: float) -> "Tally":
-        """Return this tally, taken after the consistency step, with the network's own results.
+        """Return this tally, taken after the consistency step, with what a tally before it counted.
 
         Args:
-            network: the tally before the step.
-            change_squared: sum of the squared changes of the step.
+            network: the tally of the network's results, before the consistency step.
+            change_squared: the sum of the squared changes by the consistency step.
         """
         return replace(
             self,
@@ -174,22 +178,24 @@ class Tally:
 
     @property
     def share_at_ends(self) -> float:
-        """The share of the results at 0 or full scale where the image lies between."""
+        """The share of the results that are 0 or full scale where the raw pixel lies between."""
         return self.at_ends / max(self.valid_results, 1)
 
     @property
     def means(self) -> tuple[float, float]:
-        """Mean before and after, in shares of full scale; 0 if they cannot be compared."""
+        """The mean of the raw pixels and of the results, in shares of full scale; both are 0 if the
+        network returns other bands.
+        """
         return self.before / max(self.compared, 1), self.after / max(self.valid_results, 1)
 
     @property
     def moved(self) -> float:
-        """The change of the mean (after minus before)."""
+        """The mean of the results minus that of the raw pixels, in shares of full scale."""
         return self.means[1] - self.means[0]
 
     @property
     def mean_bound(self) -> float:
-        """The largest change of the mean that gives no warning."""
+        """The largest change of the mean that gives no warning, in shares of full scale."""
         count = max(self.compared, 1)
         # A border of zeros changes the mean of a small image, hence the standard error.
         scatter = SCATTER * self.spreads[0] / math.sqrt(count)
@@ -198,7 +204,7 @@ class Tally:
 
     @property
     def spreads(self) -> tuple[float, float]:
-        """Standard deviation before and after, in shares of full scale."""
+        """The standard deviation of the raw pixels and of the results, in shares of full scale."""
         before, after = self.means
         before_square = self.before_squared / max(self.compared, 1)
         after_square = self.after_squared / max(self.valid_results, 1)
@@ -209,13 +215,17 @@ class Tally:
 
     @property
     def flat(self) -> bool:
-        """True if the results are constant and the image is not."""
+        """True if the results are constant (less than `FLAT` of the contrast is left) and the raw
+        image is not.
+        """
         before, after = self.spreads
         return before > LEAST_SPREAD and after < FLAT * before
 
     @property
     def figures(self) -> Mapping[str, Figure]:
-        """Figures of clipped pixels, ends and the mean, for the results of a run."""
+        """The figures of every run, by name: raw pixels above full scale, results at 0 or full
+        scale, and the change of the mean.
+        """
         ends = "results at 0 or full scale where the image is not"
         mean = "mean of the known pixels, after less before"
         return {
@@ -228,7 +238,9 @@ class Tally:
 
     @property
     def exposure_figures(self) -> Mapping[str, Figure]:
-        """Figures of the exposures of the network, for the results of a run."""
+        """The figures of a run with exposures, by name: runs of the network per tile, and the share
+        of results that were restored at a factor above 1.
+        """
         runs = "exposures that tiles asked for, mean of the tiles"
         pixels = "restored at an exposure above 1"
         share = 100 * self.brightened / max(self.valid_results, 1)
@@ -239,14 +251,18 @@ class Tally:
 
     @property
     def consistency_figures(self) -> Mapping[str, Figure]:
-        """The change by the consistency step, for the results of a run."""
+        """The figure of a run with the consistency step, by name: the root mean square of its
+        changes, in % of full scale.
+        """
         rms = math.sqrt(self.change_squared / max(self.valid_results, 1))
         source = "root mean square of what the step added to the known pixels"
         return {"consistency step": measured(100 * rms, "% of full scale", source)}
 
     @property
     def doubts(self) -> list[str]:
-        """The warnings, one clause each, on the network's results before the consistency step."""
+        """The warnings on an implausible result, one clause each; empty for a plausible one. They
+        look at the network's results before the consistency step.
+        """
         clauses = []
         # The consistency step gives nearly any image the mean of the raw one, and so would hide
         # a network that does not fit.
@@ -271,7 +287,11 @@ class Tally:
         return clauses
 
     def require(self, name: str) -> None:
-        """Raise ImageError if no restoration returns such results.
+        """Raise ImageError if the results differ from the raw image as no restoration does.
+
+        At least `FEW` results are refused if nearly all of them are 0 or full scale, if nearly all
+        raw pixels are above full scale, if the mean moved by more than half of full scale, or if
+        the results are constant and the raw image is not.
 
         Args:
             name: the name of the image, for the message.

@@ -25,16 +25,18 @@ OUT_SUFFIXES = TIFF_SUFFIXES | {".btf", ".tf8"}
 
 @dataclass(frozen=True)
 class Output:
-    """The files that a run writes.
+    """The options of a run that state which files it writes, and how.
 
     Attributes:
-        path: the path of the TIFF.
+        path: the path of the restored image, a TIFF.
         compression: the compression of the TIFF.
         cog: True for a Cloud-Optimised GeoTIFF.
         resume: True to continue a run that was stopped.
-        self_check: the path of the map of the self-check; None writes no map.
-        interval: the level of the half-widths that are written next to the TIFF; None writes none.
-        others: further files that will be written, none of which may be an input.
+        self_check: the path of the map that shows, block by block, if the result agrees with the
+            raw image; None writes no map.
+        interval: the level, in percent, of the interval of each pixel whose half-widths are written
+            next to the TIFF; None writes none.
+        others: further files that will be written, or None in their place; none may be an input.
     """
 
     path: Path
@@ -47,8 +49,8 @@ class Output:
 
 
 def require_tiff_name(path: Path) -> None:
-    """Raise OptionError if the output's name is not that of a TIFF, or if a sidecar of that name
-    exists.
+    """Raise OptionError if the path of the restored image has no suffix of a TIFF, or if a sidecar
+    file (.msk or .aux.xml) exists already that readers would apply to the new image.
     """
     if path.suffix.lower() not in OUT_SUFFIXES:
         raise OptionError(
@@ -65,8 +67,16 @@ def require_tiff_name(path: Path) -> None:
 
 
 def what_was_done(networks: Sequence[Network], scale: FullScale) -> dict[str, str]:
-    """Return the metadata that records a run in its output: this tool, the networks in the order of
-    the bands, their sensors, and the full scale.
+    """Return the metadata that records a run in its Cloud-Optimised GeoTIFF.
+
+    Args:
+        networks: the networks that restored the bands, in the order of the bands; empty for the
+            traditional pipeline.
+        scale: the full scale of the image, and who states it.
+
+    Returns:
+        The version of this tool, the full scale and the variant, digest and sensor of the networks,
+        by the name of the metadata item.
     """
     about = {
         RESTORED_BY: f"beers-deploy {version('beers-deploy')}",
@@ -84,7 +94,9 @@ def what_was_done(networks: Sequence[Network], scale: FullScale) -> dict[str, st
 
 
 class RestoredPixels:
-    """The finished rows of a checkpoint, and the mask or alpha of the image, enlarged with it."""
+    """The restored image as the writers of rasters read it: the finished rows of a checkpoint, and
+    the raw image's mask or alpha, enlarged by the scale of the network.
+    """
 
     def __init__(self, checkpoint: Checkpoint, source: Source) -> None:
         self._checkpoint = checkpoint
@@ -92,11 +104,13 @@ class RestoredPixels:
         self._scale = checkpoint.shape[2] // source.raster.width_px
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
-        """Return rows `start` to `stop` (excluded) of one band, (rows, width)."""
+        """Return restored rows `start` to `stop` (excluded) of one band, (rows, width)."""
         return self._checkpoint.read(band, start, stop)
 
     def read_mask(self, start: int, stop: int) -> np.ndarray:
-        """Return the same rows of the mask or of alpha, (rows, width)."""
+        """Return rows `start` to `stop` (excluded) of the enlarged mask or alpha, (rows, width); 0
+        marks a missing pixel.
+        """
         scale = self._scale
         plane = self._source.read_mask(start // scale, -(-stop // scale))
         enlarged = plane.repeat(scale, axis=0)[start % scale :][: stop - start]
@@ -106,13 +120,19 @@ class RestoredPixels:
 def write_output(
     checkpoint: Checkpoint, source: Source, output: Output, about: Mapping[str, str]
 ) -> None:
-    """Write the checkpoint's rows to the output, rename it into place, remove the checkpoint.
+    """Write the restored image from its finished rows, and remove the checkpoint.
+
+    The TIFF is written in the checkpoint's folder and renamed into place at the end, so that the
+    output is always the old image or the whole new one.
 
     Args:
-        checkpoint: with every row.
-        source: the image, whose mask or alpha is copied.
-        output: what is written.
-        about: metadata of a Cloud-Optimised GeoTIFF.
+        checkpoint: the rows of the restored image, all of them finished.
+        source: the raw image, whose mask or alpha is copied.
+        output: the options of the TIFF: its compression, and whether it is cloud-optimised.
+        about: metadata that a Cloud-Optimised GeoTIFF gets; a plain TIFF gets none of it.
+
+    Raises:
+        MachineError: the disk is full or cannot be written.
     """
     raster = source.raster.enlarged(checkpoint.shape)
     pixels = RestoredPixels(checkpoint, source)

@@ -22,11 +22,12 @@ from beers_deploy.quant.tiling.receptive_field import Tiling
 
 @dataclass(frozen=True)
 class Tiles:
-    """The user's choice of how to cut an image.
+    """The user's choice of how to cut an image into tiles, as the options of `restore` state it.
 
     Attributes:
-        side_px: longest side of a tile.
-        halo: 'exact', or pixels of context around a tile.
+        side_px: the longest side of a tile in pixels, halo included.
+        halo: the context that is read around the retained part of a tile: a number of pixels as
+            text, or 'exact' for the network's receptive radius, which leaves no seams.
     """
 
     side_px: int = TILE_PX
@@ -34,7 +35,15 @@ class Tiles:
 
 
 def parse_halo(halo: str, radius_px: int) -> int:
-    """Return the halo in pixels that a user requests. 'exact' is the network's receptive radius."""
+    """Convert the user's option `halo` to a number of pixels.
+
+    Args:
+        halo: 'exact', or a whole number of pixels as text.
+        radius_px: the network's receptive radius, which is the halo that 'exact' stands for.
+
+    Raises:
+        OptionError: the text is neither 'exact' nor a whole number.
+    """
     if halo == "exact":
         return radius_px
     if halo.isdecimal():
@@ -47,10 +56,14 @@ def parse_halo(halo: str, radius_px: int) -> int:
 
 @dataclass(frozen=True)
 class Span:
-    """One side of a tile: the part that it reads, and the part of it that is retained, in image
-    pixels (end excluded).
+    """The extent of a tile along one side of the image, in image pixels (ends excluded).
 
-    The part that is read may end beyond the image, by less than the network's lattice.
+    Attributes:
+        start: the first pixel that the tile reads, halo included.
+        stop: the end of the pixels that the tile reads. It may lie beyond the image, which is
+            extended there to a multiple of the network's stride and to the network's shortest side.
+        keep_start: the first pixel of the retained part, whose restored values are stored.
+        keep_stop: the end of the retained part, at most the end of the image.
     """
 
     start: int
@@ -60,7 +73,14 @@ class Span:
 
 
 class TilePlace(NamedTuple):
-    """The place of a tile: the group of bands, and its rows and columns."""
+    """The place of a tile in an image.
+
+    Attributes:
+        group: the index, from 0, of the bands that the network restores jointly. A network of one
+            band has one group for each band of the image.
+        rows: the rows that the tile reads and retains.
+        columns: the columns that the tile reads and retains.
+    """
 
     group: int
     rows: Span
@@ -70,15 +90,21 @@ class TilePlace(NamedTuple):
 def plan_side(
     size_px: int, tile_px: int, halo_px: int, alignment_px: int = 1, min_side_px: int = 1
 ) -> list[Span]:
-    """Return the spans along one side of `size_px` pixels, each of `tile_px`, or a single span if
-    the side is shorter.
+    """Cut one side of an image into spans of equal length, whose retained parts cover the side.
+
+    A side that is shorter than a tile is one span.
 
     Args:
-        size_px: the size of the image.
-        tile_px: side of a tile; rounded down to the lattice.
-        halo_px: a multiple of the lattice.
-        alignment_px: spans begin and end at multiples of this.
-        min_side_px: the minimum length of a span, which may reach beyond the image.
+        size_px: the length of this side of the image.
+        tile_px: the longest side of a tile; it is rounded down to a multiple of `alignment_px`.
+        halo_px: the context around the retained part; a multiple of `alignment_px`.
+        alignment_px: the multiple at which spans begin and end, because the strides of the network
+            repeat after this number of pixels; 1 without strides.
+        min_side_px: the shortest side that the network accepts. A shorter image is extended to it.
+
+    Raises:
+        OptionError: the halo is negative, or a tile is too small to retain `alignment_px` pixels
+            between two halos.
     """
     if tile_px < 2 * halo_px + alignment_px or halo_px < 0:
         least = f", at least {2 * halo_px + alignment_px} px" if alignment_px > 1 else ""
@@ -97,7 +123,18 @@ def _up(size_px: int, alignment_px: int) -> int:
 
 
 def even_side_px(size_px: int, tile_px: int, halo_px: int, alignment_px: int = 1) -> int:
-    """Return the shortest side that needs no more tiles than `tile_px` does."""
+    """Return the shortest side of a tile, in pixels, with which there are as many tiles as with
+    `tile_px`.
+
+    Args:
+        size_px: the length of one side of the image.
+        tile_px: the longest side that a tile may have.
+        halo_px: the context around the retained part of a tile.
+        alignment_px: the multiple at which tiles begin and end; 1 without strides.
+
+    Raises:
+        OptionError: tiles of `tile_px` are too small for the halo.
+    """
     # A last tile that is moved inward computes pixels twice; even tiles compute fewer.
     count = len(plan_side(size_px, tile_px, halo_px, alignment_px))
     even_px = -(-(_up(size_px, alignment_px) + 2 * halo_px * (count - 1)) // count)
@@ -105,8 +142,8 @@ def even_side_px(size_px: int, tile_px: int, halo_px: int, alignment_px: int = 1
 
 
 def _spans(image_px: int, size_px: int, tile_px: int, halo_px: int) -> Iterator[Span]:
-    """Yield spans over `size_px`, the image and its extension. The retained parts end with the
-    image.
+    """Yield the spans of one side. They are read from `size_px` pixels, the image and its
+    extension, but their retained parts end with the image, after `image_px` pixels.
     """
     done = 0
     # All spans have the same length, so the last one is moved inward instead of cut.
@@ -120,16 +157,16 @@ def _spans(image_px: int, size_px: int, tile_px: int, halo_px: int) -> Iterator[
 
 @dataclass(frozen=True)
 class Plan:
-    """Rows and columns of tiles over an image of `bands` bands.
+    """The rows and columns of tiles into which one image is cut for one network.
 
     Attributes:
-        bands: the bands of the image. Each is cut in the same way and restored separately, or
-            jointly if the network reads several.
+        bands: the number of bands of the image. Each is cut in the same way and restored
+            separately, or jointly if the network reads several.
         height_px: the height of the image.
         width_px: the width of the image.
-        tile_px: the longest side of a tile.
-        halo_px: context around the retained part of a tile.
-        tiling: the network's tiling geometry.
+        tile_px: the longest side that a tile may have.
+        halo_px: the context that is read around the retained part of a tile.
+        tiling: the network's tiling geometry: its receptive radius, stride, scale and bands.
         rows: the rows of tiles, from top to bottom.
         columns: the columns of tiles, from left to right.
     """
@@ -155,12 +192,16 @@ class Plan:
 
     @property
     def groups(self) -> int:
-        """The number of groups of bands that the network restores jointly."""
+        """The number of groups of bands: 1 if the network restores all bands jointly, else one
+        group for each band.
+        """
         return self.bands // self.tiling.channels_in
 
     @property
     def out_shape(self) -> tuple[int, int, int]:
-        """The shape of the restored image: (bands, H, W)."""
+        """The shape of the restored image, (bands, H, W), with the bands that the network returns
+        and its scale applied to both sides.
+        """
         return (
             self.groups * self.tiling.channels_out,
             self.height_px * self.scale,
@@ -169,11 +210,16 @@ class Plan:
 
     @property
     def tile_shape(self) -> tuple[int, int]:
-        """The number of rows and columns of pixels of every tile."""
+        """The height and width in pixels that every tile reads, halo included."""
         return self.rows[0].stop - self.rows[0].start, self.columns[0].stop - self.columns[0].start
 
     def places(self, row: Span) -> list[TilePlace]:
-        """Return the tiles of one row of tiles, in the order in which they are restored."""
+        """Return the tiles of one row of tiles in the order in which they are restored: group of
+        bands by group, each from left to right.
+
+        Args:
+            row: one of `rows`.
+        """
         across = product(range(self.groups), self.columns)
         return [TilePlace(group, row, column) for group, column in across]
 
@@ -184,12 +230,14 @@ class Plan:
 
     @property
     def tiles(self) -> int:
-        """The number of tiles of the image, each of which is one run of the network."""
+        """The number of tiles of the image, over all groups of bands."""
         return len(self.rows) * self.row_tiles
 
     @property
     def work_factor(self) -> float:
-        """The number of pixels that the network reads, relative to the pixels of the image."""
+        """The number of pixels that the network reads in all tiles, halos included, over the number
+        of pixels of the image: 1.2 means 20 % more work than without tiles.
+        """
         window_px = sum(r.stop - r.start for r in self.rows) * sum(
             c.stop - c.start for c in self.columns
         )
@@ -197,7 +245,9 @@ class Plan:
 
     @property
     def figures(self) -> dict[str, Figure]:
-        """The figures of how an image is cut. They are known in advance, not measured."""
+        """The figures 'tiles' and 'work factor' for the results of a run, by name. They are known
+        in advance, not measured.
+        """
         numbers = {"tiles": self.tiles, "work factor": self.work_factor}
         source = "arithmetic on the plan of tiles"
         return {
@@ -206,21 +256,23 @@ class Plan:
 
     @property
     def strip_rows_px(self) -> int:
-        """The largest number of rows that are read at once: those of a tile, and those from which
-        missing pixels are filled.
+        """The largest number of rows of pixels that are read from the image at once: the rows of a
+        tile, and a receptive radius above and below it, from which missing pixels are filled.
         """
         return min(self.tile_shape[0] + 2 * self.radius_px, self.height_px)
 
     @property
     def halo_words(self) -> str:
-        """The halo, and whether the seams are exact with it, in words."""
+        """The halo in pixels as text, with a note if it is smaller than the receptive radius, so
+        that seams between tiles are not exact.
+        """
         if self.halo_px >= self.radius_px:
             return f"{self.halo_px} px (exact)"
         return f"{self.halo_px} px (seams: exact is {self.radius_px})"
 
     @property
     def sentence(self) -> str:
-        """How the image is cut, in one sentence for the user."""
+        """The sentence that a run logs on its tiles: number, size, halo and work factor."""
         bands = f", {self.bands} bands" if self.bands > 1 else ""
         larger = f", {self.scale} times as large" if self.scale > 1 else ""
         rows_px, columns_px = self.tile_shape
@@ -233,7 +285,18 @@ class Plan:
 
 
 def plan_for(network: Network, shape: tuple[int, int, int], tiles: Tiles) -> Plan:
-    """Return the plan of how an image of `shape` (bands, H, W) is cut for a network."""
+    """Plan the tiles of an image for a network, as the user's options state them.
+
+    Args:
+        network: the network that restores the image.
+        shape: the shape of the image, (bands, H, W).
+        tiles: the size of tiles and the halo that the user chooses.
+
+    Raises:
+        OptionError: the tile size, the halo or the number of bands does not fit the network, or the
+            network is fixed to one tile size, and `tiles` states another or the image is smaller.
+        ModelError: the network returns an image whose size is no multiple of the image's.
+    """
     tiling = network.tiling
     _, height_px, width_px = shape
     if tiling.fixed_px is not None and (
@@ -248,10 +311,21 @@ def plan_for(network: Network, shape: tuple[int, int, int], tiles: Tiles) -> Pla
 
 
 def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, tiling: Tiling) -> Plan:
-    """Return the plan for an image of `shape` (bands, H, W).
+    """Plan the tiles of an image, given a halo in pixels and the geometry of a network.
 
     Tiles are as even as possible, with at most `tile_px` a side. If the network is fixed to a tile
-    size, they have exactly that size.
+    size, they have exactly the size `tile_px`.
+
+    Args:
+        shape: the shape of the image, (bands, H, W).
+        tile_px: the longest side of a tile, or the side that the network is fixed to.
+        halo_px: the context that is read around the retained part of a tile.
+        tiling: the network's tiling geometry.
+
+    Raises:
+        OptionError: the halo is no multiple of the network's stride or too large for the tile, or
+            the network reads another number of bands.
+        ModelError: the network returns an image whose size is no multiple of the image's.
     """
     bands, height_px, width_px = shape
     _require_fit(bands, halo_px, tiling)

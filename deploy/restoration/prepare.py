@@ -57,23 +57,24 @@ RUNS_UNTIL_STEADY = 2
 
 @dataclass(frozen=True, kw_only=True)
 class Restoration(ABC):
-    """The restoration of one image.
+    """The restoration of one image by one method, ready to compute its first row.
 
     Attributes:
         source: the image.
         name: the name of the image, for messages.
-        reading: how its pixels are interpreted.
-        networks: the networks that restore its bands; empty for the traditional pipeline.
-        scale: the pixel value that is full scale.
-        check: the result of checking the image's sensor.
-        check_s: the seconds that the check took.
+        reading: how the pixels of the image are interpreted.
+        networks: the networks that restore the bands, one for all or one for each in the order of
+            the bands; empty for the traditional pipeline.
+        scale: the pixel value that is full scale, and who states it.
+        check: the result of comparing the image with its sensor.
+        check_s: the seconds that this comparison took.
         out_shape: the shape of the restored image, (bands, H, W).
         row_ends: the row of the restored image at which each row of tiles ends, where a later run
-            can continue; empty if it cannot.
-        identity: all parameters that determine the pixels, besides the image and the full scale.
-            The number and kind of machines is not part of it.
-        how: the runtime and machines, for the figures of time.
-        text: the run in words.
+            can continue; empty if no run can continue.
+        identity: all parameters that determine the pixels, besides the image and the full scale, by
+            name. A run is resumed only if they are equal. Machines are not part of them.
+        how: the runtime and machines in words, for the figures of time.
+        text: facts of the run in words, by name, for its row of results.
     """
 
     source: Source
@@ -91,15 +92,20 @@ class Restoration(ABC):
 
     @abstractmethod
     def ticks(self, done_px: int) -> int:
-        """Return the number of progress ticks from row `done_px` of the restored image on."""
+        """Return the number of progress ticks that remain: one for each tile of a network, or one
+        for each row of pixels of the traditional pipeline.
+
+        Args:
+            done_px: the number of rows of the restored image that an earlier run finished.
+        """
 
     @abstractmethod
     def rows(self, done_px: int, tick: Tick) -> Generator[RestoredRow, None, None]:
         """Restore the image from row `done_px` of the result on, in order.
 
         Args:
-            done_px: rows of the restored image that an earlier run finished.
-            tick: called with the number of ticks that were completed.
+            done_px: the number of rows of the restored image that an earlier run finished.
+            tick: called with the number of ticks that were completed since its last call.
 
         Yields:
             The next restored rows of all bands.
@@ -107,35 +113,48 @@ class Restoration(ABC):
 
     @abstractmethod
     def watch_memory(self, done: int, total: int) -> None:
-        """Check the memory again, if this tick is the one after which its use is steady.
+        """Check the memory again, once, at the tick after which the use of memory is steady.
 
         Args:
-            done: number of ticks of this run so far.
-            total: number of all its ticks.
+            done: the number of ticks of this run so far.
+            total: the number of all ticks of this run.
+
+        Raises:
+            MachineError: the memory in use and the rows to come exceed the memory that is allowed.
         """
 
     @abstractmethod
     def figures(self, tally: Tally) -> dict[str, Figure]:
-        """Return the figures of a run from its tally."""
+        """Return the figures of a finished run by name, for its row of results.
+
+        Args:
+            tally: counts and sums over the image and its result.
+        """
 
 
 class Pipeline(Protocol):
-    """A method that can restore images."""
+    """A method that can restore any image: a network or the traditional pipeline."""
 
     @property
     def engine(self) -> Engine:
-        """The engine that runs its networks."""
+        """The runtime, threads and Dask scheduler that run the networks of the method."""
 
     def prepare(
         self, source: Source, reading: Reading, name: str, cluster: Cluster | None = None
     ) -> Restoration:
-        """Prepare the restoration of an image.
+        """Prepare the restoration of an image: check it, and plan how it is cut.
 
         Args:
             source: the image.
-            reading: how its pixels are interpreted.
+            reading: how the pixels of the image are interpreted.
             name: the name of the image, for messages.
-            cluster: the cluster whose workers run the network; None runs it here.
+            cluster: the cluster whose workers run the network; None runs the network here.
+
+        Returns:
+            The restoration, from which `rows` computes the restored image.
+
+        Raises:
+            BeersError: the options or the method do not fit the image, or memory is too small.
         """
 
 
@@ -145,9 +164,10 @@ class NetworkRestoration(Restoration):
 
     Attributes:
         plan: how the image is cut into tiles.
-        restorer: restores a tile.
-        at_once: the number of tiles in work at a time.
-        seams: figures of the error at seams.
+        restorer: restores single tiles with the network and the steps around it.
+        at_once: the number of tiles that are computed at a time.
+        seams: figures of the error at the seams between tiles, in digital numbers; empty if the
+            halo leaves no seams.
     """
 
     plan: Plan
@@ -159,12 +179,14 @@ class NetworkRestoration(Restoration):
         return [row for row in self.plan.rows if row.keep_start * self.plan.scale >= done_px]
 
     def ticks(self, done_px: int) -> int:
-        """Return the number of tiles to run."""
+        """Return the number of tiles on which the network still has to run."""
         rows = rows_to_run(self.restorer, self._rows_left(done_px))
         return len(rows) * self.plan.row_tiles
 
     def rows(self, done_px: int, tick: Tick) -> Generator[RestoredRow, None, None]:
-        """Restore rows of tiles from row `done_px` of the restored image on."""
+        """Restore rows of tiles in order, from row `done_px` of the restored image on. `tick` is
+        called with 1 after each tile.
+        """
         rows = self._rows_left(done_px)
         return restore_rows(self.source, self.restorer, rows, lambda: tick(1), self.at_once)
 
@@ -180,7 +202,7 @@ class NetworkRestoration(Restoration):
         )
 
     def figures(self, tally: Tally) -> dict[str, Figure]:
-        """Return the figures of a run."""
+        """Return the figures of tiles, seams and tally, and of the steps that were used."""
         figures = {**self.plan.figures, **self.seams, **tally.figures}
         if any(len(network.infers) > 1 for network in self.restorer.networks):
             figures |= tally.exposure_figures
@@ -191,13 +213,13 @@ class NetworkRestoration(Restoration):
 
 @dataclass(frozen=True)
 class NetworkPipeline:
-    """A network, or one for each band, and how it is run.
+    """The method that restores images by a network, or by one network for each band.
 
     Attributes:
-        networks: by band, or under "" if one is for all.
-        tiles: how an image is cut.
-        engine: runs the networks.
-        around: the choice of the steps around them.
+        networks: the networks by the name of the band; a network for all bands has the key "".
+        tiles: how images are cut into tiles.
+        engine: the runtime, threads and Dask scheduler that run the networks.
+        around: the steps around the networks that are used: exposures and the consistency step.
     """
 
     networks: Mapping[str, Network]
@@ -208,7 +230,7 @@ class NetworkPipeline:
     def prepare(
         self, source: Source, reading: Reading, name: str, cluster: Cluster | None = None
     ) -> NetworkRestoration:
-        """Prepare the network to restore an image; see `Pipeline.prepare`."""
+        """Prepare the restoration of an image by the network, as `Pipeline.prepare` describes."""
         raster = source.raster
         networks = in_order(self.networks, raster)
         require_alike(networks)
@@ -291,11 +313,15 @@ def _opener(
 
 
 def seam_figures(source: Source, plan: Plan, restorer: Restorer) -> dict[str, Figure]:
-    """Measure the error of seams on a tile in the middle, in digital numbers, if the halo leaves
-    seams.
+    """Measure the error at the seams between tiles, in digital numbers, if the halo leaves seams.
 
-    The same retained pixels are restored twice: from the tile's own window, and from one with the
-    whole radius around it.
+    The retained pixels of the tile in the middle of the image are restored twice: with the halo of
+    the plan, and with the network's whole receptive radius around them.
+
+    Returns:
+        The largest and the mean absolute difference, as 'seam error max' and 'seam error mean'.
+        They are unavailable if the network is fixed to one tile size. The dict is empty if the halo
+        is exact or there is one tile.
     """
     keys = "seam error max", "seam error mean"
     if plan.halo_px >= plan.radius_px or len(plan.rows) == len(plan.columns) == 1:
@@ -350,8 +376,18 @@ def check_sensor(
     A warning is logged for each fault and each contradiction. If no sensor is named, a warning is
     logged if the image looks restored already.
 
+    Args:
+        source: the image.
+        networks: the networks that are to restore the image; none for the traditional pipeline.
+        reading: the options of the run, which name the sensors.
+        full_scale: the pixel value that is full scale.
+        name: the name of the image, for messages.
+
     Returns:
-        The check, and the seconds that it took.
+        The result of the comparison, and the seconds that all of this took.
+
+    Raises:
+        ImageError: the image contradicts its sensor, and the option `strict` is set.
     """
     started = time.perf_counter()
     warn_of_detectors(source, full_scale)

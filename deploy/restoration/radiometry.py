@@ -20,15 +20,16 @@ from beers_deploy.profiles.sensor import Sensor
 
 @dataclass(frozen=True)
 class Reading:
-    """Options that decide how an image is read.
+    """The options of a run that decide how the pixels of its image are interpreted and checked.
 
     Attributes:
-        sensors: the sensors that the user names, by band. One sensor for all bands has the key "";
-            the mapping is empty if none is named.
+        sensors: the sensors that the user names, by the name of the band. One sensor for all bands
+            has the key ""; the mapping is empty if none is named.
         full_scale: the pixel value that is 1.0 to a network; None to take it from the file or the
             sensor.
         nodata: the value of an array's missing pixels, in addition to NaN; a file states its own.
-        strict: True to refuse an image that contradicts its sensor.
+        strict: True to refuse an image that contradicts its sensor, and a result that contradicts
+            its raw image.
         force: True to accept an image that was restored before and an index that leads to tiles
             outside its folder or at URLs, and to write implausible results.
         memory_bytes: memory budget of this process; None for all that is free.
@@ -45,18 +46,20 @@ class Reading:
 
     @property
     def sensor_bits(self) -> int | None:
-        """Bits per pixel of the named sensors, the least of them; None if none is named."""
+        """The number of bits per pixel of the named sensors, and of several the smallest; None if
+        none is named.
+        """
         return min((int(sensor.bits.low) for sensor in self.sensors.values()), default=None)
 
 
 @dataclass(frozen=True)
 class FullScale:
-    """A full scale and its source.
+    """The full scale of an image, which is 1.0 to a network, and its source.
 
     Attributes:
         value: the pixel value that is full scale.
-        source: what states it, for messages.
-        assumed: True if nothing states it.
+        source: in words, who states it: the user, the file, the sensor or an assumption.
+        assumed: True if nobody states it, so that 12 bits are assumed.
     """
 
     value: float
@@ -65,12 +68,12 @@ class FullScale:
 
     @property
     def words(self) -> str:
-        """The value and its source, in words."""
+        """The value and its source in words, such as "4095 (12 bits, of the sensor)"."""
         return f"{self.value:g} ({self.source})"
 
     @property
     def text(self) -> dict[str, str]:
-        """The value and its source as the text of a row of results."""
+        """The value and its source as two entries, by name, for the row of results of a run."""
         return {"full scale": f"{self.value:g}", "full scale from": self.source}
 
 
@@ -81,18 +84,20 @@ def full_scale_of(
     requested: float | None = None,
     bits: int | None = None,
 ) -> FullScale:
-    """Return the full scale of an image: the user's, that of its file, of the sensor, or 12 bits.
+    """Determine the full scale of an image: that of the user, the file, the sensor, or 12 bits.
 
     Args:
         name: the name of the image, for messages.
-        raster: the description of its file.
-        extents: as for `model.raster.full_scale.settled_scale`, drawn for floats only.
+        raster: the description of the image.
+        extents: for each part of the image its largest value, and whether its values are integers.
+            They are read for float pixels only, to tell digital numbers from other units.
         requested: the full scale that the user gives, or None.
-        bits: bits per pixel of the sensor, if the user names its profile.
+        bits: the number of bits per pixel of the sensor, if the user names its profile, or None.
 
     Raises:
-        OptionError: a full scale that is not positive, or that the output's type cannot hold.
-        ImageError: pixels that contradict an assumed full scale.
+        OptionError: the user's full scale is not positive, or the output's type cannot hold it.
+        ImageError: the pixels have 8 bits, or are floats that may be other units than digital
+            numbers, and neither the user nor the file states a full scale.
     """
     if requested is not None:
         settled_scale(name, raster.dtype, extents, requested)

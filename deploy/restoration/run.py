@@ -66,11 +66,12 @@ MANY = 0.05
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Run(Table):
-    """The figures of one file that was restored into another.
+    """The table of results of one file that was restored into another, which `restore` returns.
 
     Attributes:
         path: the path of the restored image.
-        time_s: the seconds from opening the image to the finished file.
+        time_s: the seconds from opening the image to the finished file, without those of the sensor
+            check and the self-check.
         networks: the networks that restored the bands, in the order of the bands; empty for the
             traditional pipeline.
     """
@@ -83,15 +84,23 @@ class Run(Table):
 def restore_file(
     image: Path, output: Output, reading: Reading, load: Callable[[], Pipeline]
 ) -> Run:
-    """Restore an image file into a TIFF, and return the run's figures.
+    """Restore an image file into a TIFF, and return the table of the run's figures.
+
+    The TIFF has the pixel type `Raster.out_dtype`, the full scale and the place on Earth of the
+    image. It is larger than the image if the network enlarges images.
 
     Args:
         image: a file that `model.raster.reader.open_raster` opens, of any size.
-        output: the TIFF, of the type `Raster.out_dtype`, in the scale of the image; larger by the
-            network's factor where it has one, and in its place on Earth.
-        reading: how its pixels are interpreted.
-        load: returns the pipeline that restores it. It is called once the image and the output are
-            accepted.
+        output: the files to write, and whether an earlier run is continued.
+        reading: how the pixels of the image are interpreted.
+        load: returns the pipeline that restores the image, a network or the traditional one. It is
+            called once the image and the output are accepted.
+
+    Raises:
+        OptionError: an option does not fit the image, the network or an earlier run.
+        ImageError: the image cannot be read, changed during the run, or has an implausible result.
+        ModelError: the network cannot restore the image.
+        MachineError: the memory or the disk is too small, or the workers do not answer.
     """
     out = output.path
     widths = None if output.interval is None else interval_beside(out)
@@ -180,7 +189,7 @@ def _write_interval(
 
 
 def _inputs(work: Restoration) -> list[Input]:
-    """Return the networks that a result rests on, with the band of each if there are several."""
+    """Return the networks as inputs of the table of results; each of several names its band."""
     if len(work.networks) < 2:
         return [network.input for network in work.networks]
     # The user may name the bands in another order than that of the image and of the networks.
@@ -193,9 +202,22 @@ def _inputs(work: Restoration) -> list[Input]:
 
 @contextmanager
 def begun(image: Path, output: Output, reading: Reading) -> Iterator[Source]:
-    """Open the image of the only run on an output, once all that can be checked before is checked.
+    """Open the image of a run, after all checks that need no pixels, and lock its output.
 
-    The arguments are those of `restore_file`.
+    While the image is open, no other run may write the same output.
+
+    Args:
+        image: the file to restore.
+        output: the files to write.
+        reading: the options of the run, of which `force` accepts an image that was restored before.
+
+    Yields:
+        The opened image.
+
+    Raises:
+        BeersError: the image cannot be opened or was restored before, the output cannot be
+            written, is an input, has no name of a TIFF or a codec that GDAL lacks, or another run
+            writes it.
     """
     require_image_file(image)
     require_writable(output.path, inputs=[image])
@@ -244,9 +266,10 @@ def require_unchanged(
 
     Args:
         source: the image.
-        name: its name, for the message.
-        before: the stamps of its files before the first row was read.
-        digest: its fingerprint at that time.
+        name: the name of the image, for the message.
+        before: size, time of change and inode of each file of the image before the first row was
+            read, as `stamps` returns them.
+        digest: the `fingerprint` of the files' content at that time.
     """
     # A file that was only touched or copied back is the same image: its content decides.
     if stamps(source.files) != before and fingerprint(source.files) != digest:
@@ -336,7 +359,9 @@ def _row(
     faults: FaultList,
     more: dict[str, Figure],
 ) -> Row:
-    """Return the figures of one run, of which `done_px` rows were finished before, and `more`."""
+    """Return the row of results of one run, with the figures `more`. The throughput counts only the
+    rows after the first `done_px`, which an earlier run finished.
+    """
     raster = work.source.raster
     left = 1 - done_px / checkpoint.shape[1]
     useful_px = prod(raster.shape) * left

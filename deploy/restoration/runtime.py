@@ -33,13 +33,14 @@ its file states.
 
 @dataclass(frozen=True)
 class Engine:
-    """The engine that runs the networks of a restoration.
+    """The choice of what runs the networks of a restoration: a library, its threads and machines.
 
     Attributes:
-        runtime: the library.
-        threads: the threads of the runtime; 0 uses every core, or one for each call that a
-            scheduler's workers run at once.
-        scheduler: address of a Dask scheduler whose workers run the network; None runs it here.
+        runtime: the library that runs a network.
+        threads: the number of threads of the runtime. 0 uses every core of this machine, or one
+            thread for each call that a worker of a Dask scheduler runs.
+        scheduler: the address of a Dask scheduler whose workers run the networks; None runs them on
+            this machine.
     """
 
     runtime: Runtime = "onnxruntime"
@@ -52,7 +53,9 @@ class Engine:
             require_cores("threads", self.threads)
 
     def packed(self, model: onnx.ModelProto) -> "Packed":
-        """Return a network for a worker, which uses one thread unless the user gives a number."""
+        """Return a network in a form that can be sent to the workers of a Dask scheduler. It runs
+        there with `threads` threads, or with one if `threads` is 0.
+        """
         return Packed(model.SerializeToString(), self.runtime, self.threads or 1)
 
 
@@ -60,7 +63,20 @@ LOWEST = "openvino.lowest_uint8"
 
 
 def open_openvino(model: onnx.ModelProto, threads: int, at_once: int = 1) -> tuple[Infer, str]:
-    """Return a network ready to run on OpenVINO; see `open_runtime`."""
+    """Open a network on OpenVINO, with int8 results that equal those of onnxruntime.
+
+    Args:
+        model: the network.
+        threads: the number of threads of all callers together; 0 uses every core.
+        at_once: the number of callers that run the network at the same time.
+
+    Returns:
+        The network ready to run, and the runtime's name and version.
+
+    Raises:
+        MissingExtraError: OpenVINO is not installed.
+        ModelError: at the first run, if OpenVINO cannot run the network.
+    """
     openvino = optional("openvino", "runtime")
     # This fills a table: two threads that are its first callers lock each other up (2026.4).
     openvino.Type.f32.to_dtype()
@@ -112,7 +128,8 @@ def _adds_exactly(core: Any) -> bool:
 
 
 def saturating_adds(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Return the model with every QLinearAdd written as dequantise, add, quantise.
+    """Return a copy of a quantised model for OpenVINO, in which each QLinearAdd is replaced by
+    DequantizeLinear, Add and QuantizeLinear.
 
     OpenVINO's own QLinearAdd wraps around where it should saturate (256 becomes 0). The three
     operators saturate, but OpenVINO fuses them with a convolution before them, which loses the
@@ -154,8 +171,12 @@ Each tile needs the memory of a network's maps, and the gain is about 4 %.
 
 
 def tiles_at_once(threads: int, tiles: int) -> int:
-    """Return the number of tiles restored at a time, such that each has the same number of threads.
-    0 threads uses every core.
+    """Return the number of tiles to restore at a time: at most `AT_ONCE`, and a divisor of the
+    number of threads, so that each tile has the same number of them.
+
+    Args:
+        threads: the number of threads; 0 stands for one for each core.
+        tiles: the number of tiles of the image, which the result does not exceed.
     """
     cores = threads or os.cpu_count() or 1
     return max(
@@ -166,13 +187,20 @@ def tiles_at_once(threads: int, tiles: int) -> int:
 def open_runtime(
     runtime: Runtime, model: onnx.ModelProto, threads: int, at_once: int = 1
 ) -> tuple[Infer, str]:
-    """Open a network, and return it ready to run with the runtime's name and version.
+    """Open a network with the library that the user chooses.
 
     Args:
-        runtime: the library.
+        runtime: the library that runs the network.
         model: the network.
-        threads: the total number; 0 uses every core.
-        at_once: the number of callers that share the threads.
+        threads: the number of threads of all callers together; 0 uses every core.
+        at_once: the number of callers that run the network at the same time and share the threads.
+
+    Returns:
+        The network ready to run, and the runtime's name and version.
+
+    Raises:
+        OptionError: this machine has fewer cores than `threads`.
+        ModelError: the runtime cannot run the network.
     """
     require_cores("threads", threads)
     if runtime == "openvino":
@@ -182,14 +210,22 @@ def open_runtime(
 
 
 def session_threads(threads: int, at_once: int) -> int:
-    """Return the number of threads to request from onnxruntime. Of its n threads, n - 1 are its own
-    and shared by all callers, and each caller adds itself.
+    """Return the number of threads to request from onnxruntime.
+
+    Of n requested threads, onnxruntime starts n - 1, which all callers share, and each caller adds
+    its own thread. The threads of all callers together are then as many as the user allows.
+
+    Args:
+        threads: the number of threads that the user allows; 0 stands for one for each core.
+        at_once: the number of callers that run the network at the same time.
     """
     return (threads or os.cpu_count() or 1) - at_once + 1 if at_once > 1 else threads
 
 
 class AtFirstCall:
-    """A network that is opened once, when it is first run."""
+    """A network that is opened when it is first run, and stays open. Versions of a network for
+    higher exposures are opened in this way, because a bright image needs none of them.
+    """
 
     def __init__(self, open_network: Callable[[], tuple[Infer, str]]) -> None:
         self._open = open_network
@@ -197,7 +233,7 @@ class AtFirstCall:
         self._lock = Lock()
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Run the network, as an `Infer`."""
+        """Run the network on (1, C, h, w) float32 in [0, 1], and return its result."""
         # Without the lock each thread would open a network of its own.
         with self._lock:
             if self._infer is None:
@@ -207,12 +243,13 @@ class AtFirstCall:
 
 @dataclass(frozen=True)
 class Packed:
-    """A network that is opened once in each process, at its first call.
+    """A network as it is sent to the workers of a Dask scheduler. Each process opens it once, at
+    its first call.
 
     Attributes:
-        content: bytes of its ONNX file.
-        runtime: the library that runs it.
-        threads: the threads of the runtime.
+        content: the bytes of the network's ONNX file.
+        runtime: the library that runs the network.
+        threads: the number of threads of the runtime in each process.
     """
 
     content: bytes
@@ -220,7 +257,7 @@ class Packed:
     threads: int
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Run the network, as an `Infer`."""
+        """Run the network on (1, C, h, w) float32 in [0, 1], and return its result."""
         # Without the lock each thread would open a network of its own.
         with _opening:
             infer = _opened(self)
@@ -238,8 +275,15 @@ def _opened(packed: Packed) -> Infer:
 
 
 def infer_on(cluster: Cluster, engine: Engine, model: onnx.ModelProto) -> Infer:
-    """Return a network that the workers of a cluster run. Each call sends a tile and waits for its
-    result.
+    """Return a network, ready to run, that the workers of a cluster run.
+
+    The network is sent to them once. Each call of the returned function sends a tile and waits for
+    its result.
+
+    Args:
+        cluster: the workers of a Dask scheduler.
+        engine: the runtime and the number of threads on a worker.
+        model: the network.
     """
     shared = cluster.share(engine.packed(model))
     return lambda image: cluster.result(cluster.pool.submit(Packed.__call__, shared, image))

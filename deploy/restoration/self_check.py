@@ -50,30 +50,40 @@ ReadRows = Callable[[int, int, int], np.ndarray]
 class BlockMap:
     """The result of the self-check for every block of an image.
 
+    The self-check blurs the restored image as the sensor blurs, and compares blocks of `BLOCK_PX` x
+    `BLOCK_PX` pixels with the raw image.
+
     Attributes:
-        bands: the blocks of each band that has a known sensor, by its number.
+        bands: the measurements of the blocks of each band that has a known sensor, by the number of
+            the band from 0.
     """
 
     bands: Mapping[int, Judged]
 
     @property
     def known(self) -> int:
-        """The number of blocks with enough pixels."""
+        """The number of blocks, over all bands, with enough pixels to be compared."""
         return sum(int(np.isfinite(judged.chi2).sum()) for judged in self.bands.values())
 
     @property
     def decidable(self) -> int:
-        """The number of blocks that would show a wrong restoration."""
+        """The number of blocks, over all bands, that would show a wrong restoration: those that the
+        restoration sharpened enough, and those outside the bound.
+        """
         return sum(int(judged.decidable.sum()) for judged in self.bands.values())
 
     @property
     def outside(self) -> int:
-        """The number of blocks whose residual is more than noise."""
+        """The number of blocks, over all bands, that contradict the raw image: they differ from it
+        by more than noise.
+        """
         return sum(int(judged.outside.sum()) for judged in self.bands.values())
 
     @property
     def figures(self) -> dict[str, Figure]:
-        """The shares of blocks, for the results of a run."""
+        """Two figures in %, by name, for the results of a run: the share of decidable blocks that
+        contradict the raw image, and the share of blocks too smooth to decide.
+        """
         blocks = f"blocks of {BLOCK_PX} x {BLOCK_PX} pixels"
         outside = f"{blocks} that are decidable: residual above {MOST_CHI2:g} times the noise"
         smooth = f"{blocks}: too smooth to show a wrong restoration"
@@ -87,8 +97,8 @@ class BlockMap:
 
     @property
     def doubt(self) -> str:
-        """The second part of a sentence on a result that contradicts its raw image; empty if it
-        does not.
+        """The warning on a result that contradicts its raw image, without the subject of the
+        sentence; empty if at most `MANY_OUTSIDE` of the decidable blocks contradict it.
         """
         if self.outside <= MANY_OUTSIDE * self.decidable:
             return ""
@@ -101,7 +111,8 @@ class BlockMap:
         )
 
     def require(self, name: str) -> None:
-        """Raise ImageError if the result contradicts its raw image.
+        """Raise ImageError if more than `MANY_OUTSIDE` of the decidable blocks contradict the raw
+        image.
 
         Args:
             name: the name of the image, for the message.
@@ -113,14 +124,18 @@ class BlockMap:
 def checks_of(
     sensors: Mapping[str, Sensor], raster: Raster, out_shape: Sequence[int], full_scale: float
 ) -> dict[int, SelfCheck]:
-    """Build the self-check of each band whose sensor is known.
+    """Build the self-check of each band whose sensor is known. It compares the restored image,
+    blurred as the sensor blurs, with the raw image.
 
     Args:
-        sensors: by band, or one under "".
-        raster: the description of the image.
-        out_shape: (bands, H, W) of the restored image. Unless it has one pixel of the same band for
-            each pixel, there is no check.
+        sensors: the sensor by the name of the band; a sensor for all bands has the key "".
+        raster: the description of the raw image.
+        out_shape: the shape of the restored image, (bands, H, W). If it is not that of the raw
+            image, there is no self-check.
         full_scale: the pixel value that is full scale.
+
+    Returns:
+        The self-checks by the number of the band, from 0; empty if there is none.
     """
     if tuple(out_shape) != raster.shape or not sensors:
         return {}
@@ -136,12 +151,12 @@ def checks_of(
 
 
 def check_result(source: Source, read: ReadRows, checks: Mapping[int, SelfCheck]) -> BlockMap:
-    """Check all blocks of a restored image.
+    """Compare all blocks of a restored image with the raw image.
 
     Args:
         source: the raw image.
-        read: returns restored rows.
-        checks: the self-check of each band that has one.
+        read: returns restored rows (rows, width), given the band, the first row and the end.
+        checks: the self-check of each band that has one, by the number of the band from 0.
     """
     raster = source.raster
     judged: dict[int, list[Judged]] = {band: [] for band in checks}
@@ -163,7 +178,9 @@ def check_result(source: Source, read: ReadRows, checks: Mapping[int, SelfCheck]
 
 
 def _judge_rows(check: SelfCheck, raw: np.ndarray, restored: np.ndarray, down: Placed) -> Judged:
-    """Check rows (h, width) of an image window by window, which bounds the memory."""
+    """Compare restored rows (h, width) with raw ones window by window, which bounds the memory.
+    `down` states where the rows lie in the image.
+    """
     width = raw.shape[1]
     parts = []
     for start, stop in strips(width, COLUMNS_PX):
@@ -180,10 +197,16 @@ def _joined(parts: Sequence[Judged], axis: int) -> Judged:
 
 
 def write_map(path: Path, blocks: BlockMap, raster: Raster) -> None:
-    """Write the map as a GeoTIFF of float32 with one pixel for each block.
+    """Write the result of the self-check as a GeoTIFF of float32 with one pixel for each block.
 
-    It has two planes for each band that was checked: chi2, and the state of the block (0 within the
-    bound, 1 outside, 2 too smooth to decide). Both are NaN where too few pixels are known.
+    The file has two planes for each band that was checked: chi2, the mean squared difference over
+    the variance of the noise, and the state of the block (0 within the bound, 1 outside, 2 too
+    smooth to decide). Both are NaN where too few pixels are known.
+
+    Args:
+        path: the path of the GeoTIFF.
+        blocks: the result for every block.
+        raster: the description of the raw image, with its place on Earth and the names of bands.
     """
     planes = []
     infos = []

@@ -63,14 +63,16 @@ ANY = -1
 
 
 def write_item(run: Run, path: Path, maps: Mapping[str, Path]) -> None:
-    """Write the item of a Cloud-Optimised GeoTIFF that this tool has written, as JSON.
+    """Write the STAC item of a Cloud-Optimised GeoTIFF that this tool has written, as JSON.
 
-    An image without a transform and a coordinate system has no geometry in its item.
+    The item describes the image's place on Earth and how it was made. An image without a transform
+    and a coordinate system has no geometry in its item.
 
     Args:
         run: the run that wrote the image.
-        path: the path of the item; the items of its networks are written next to it.
-        maps: further rasters over the same place, by name: they become assets.
+        path: the path of the item; the items of the run's networks are written next to it.
+        maps: the paths of further rasters over the same place, such as the half-widths, by name.
+            They become assets of the item.
     """
     pystac: Any = import_module("pystac")
     now = datetime.now(UTC)
@@ -152,8 +154,8 @@ def _href(file: Path, item: Path) -> str:
 
 
 def _corners(file: Any) -> list[tuple[float, float]]:
-    """Longitude and latitude of the four corners of the first and last pixels, in degrees,
-    counter-clockwise.
+    """Return longitude and latitude, in degrees, of the four corners of an open image,
+    counter-clockwise from the upper left one.
     """
     places = [(0, 0), (0, file.height), (file.width, file.height), (file.width, 0)]
     a, b, c, d, e, f = file.transform[:6]
@@ -164,21 +166,25 @@ def _corners(file: Any) -> list[tuple[float, float]]:
 
 
 def network_paths(item: Path, count: int) -> list[Path]:
-    """Return where the items of a run's networks are written, given that of its image.
+    """Return the paths at which the STAC items of a run's networks are written.
 
-    The ONNX file of a network has the same name, with the suffix .onnx.
+    The ONNX file of a network that has no file yet is written there too, with the suffix .onnx.
+
+    Args:
+        item: the path of the item of the restored image.
+        count: the number of networks.
     """
     ends = [""] if count == 1 else [f"-{number}" for number in range(1, count + 1)]
     return [item.with_name(f"{item.stem}-network{end}.json") for end in ends]
 
 
 def write_network_item(network: Network, path: Path, when: datetime) -> None:
-    """Write the item of a network, and the network where it has no file.
+    """Write the STAC item that describes a network, and its ONNX file if it has none.
 
     Args:
         network: a network of a run.
-        path: the path of the item.
-        when: the time of the run: STAC has no item without one.
+        path: the path of the item. A network that is only in memory is saved next to it.
+        when: the time of the run, because STAC has no item without a time.
     """
     pystac: Any = import_module("pystac")
     files: Any = import_module("pystac.extensions.file")

@@ -30,11 +30,13 @@ OTHER_PIXELS = f"{OFF}: the network makes other pixels or bands"
 
 @dataclass(frozen=True)
 class Around:
-    """The choice of the steps around a network that a run uses where possible.
+    """The user's choice of the two steps around a network, which a run uses where possible.
 
     Attributes:
-        consistency: if True, the result is made to agree with the image at low spatial frequencies.
-        exposure: if True, dark parts are restored at a higher exposure.
+        consistency: True to make the result agree with the raw image at low spatial frequencies
+            (the consistency step).
+        exposure: True to restore dark parts of the image at a higher exposure: they are multiplied
+            by a factor before the network and divided by it afterwards.
     """
 
     consistency: bool = True
@@ -45,18 +47,29 @@ BOTH: Around = Around()
 
 
 def exposures_of(network: Network, around: Around) -> Mapping[int, Network]:
-    """Return the versions of a network for higher exposures, by the factor of the exposure.
+    """Return the versions of a network that restore dark parts of an image at a higher exposure.
 
     Args:
-        network: a network, with its exposures if it has some.
-        around: the steps that are used. Without exposures the result is empty.
+        network: a network. Only one that is conditioned on its sensor may have such versions.
+        around: the steps that the user chooses.
+
+    Returns:
+        The networks for sensors of higher gain, by the factor of the gain; empty if the network has
+        none, or the user omits exposure.
     """
     return network.exposures if around.exposure else {}
 
 
 def in_ranges(infer: Infer, ranges: Ranges, image: np.ndarray) -> np.ndarray:
-    """Run a network whose channels have other ranges on an image in [0, 1], and return its result
-    in [0, 1] likewise.
+    """Run a network whose file states other ranges of values than [0, 1] for its channels.
+
+    Args:
+        infer: the network, ready to run.
+        ranges: the range of values that the network reads and returns, for each channel.
+        image: (1, C, h, w) float32, as shares of full scale.
+
+    Returns:
+        The network's result, as shares of full scale, too.
     """
     return to_shares(infer(from_shares(image, ranges)), ranges)
 
@@ -68,17 +81,18 @@ def exposed_networks(
     full_scale: float,
     opened: Callable[[onnx.ModelProto], Infer],
 ) -> tuple[ExposedNetwork, ...]:
-    """Build the network of each band at its exposures.
+    """Open the networks of a run, each with its versions for higher exposures, where dark parts of
+    the image are multiplied by a factor before the network.
 
     Args:
-        networks: one for all bands or one for each.
-        around: the steps that are used, among them higher exposures.
+        networks: one network for all bands, or one for each.
+        around: the steps that the user chooses, of which this function uses `exposure`.
         tiling: the networks' tiling geometry.
         full_scale: the pixel value that is 1.0 to a network.
-        opened: opens a network.
+        opened: returns a network ready to run, given its ONNX model.
 
     Returns:
-        The networks in the given order. Without exposures a network has the factor 1 alone.
+        The opened networks in the given order. Without exposures a network has the factor 1 alone.
 
     Raises:
         ModelError: the ranges of a network were found in samples, so that full scale is not known.
@@ -98,10 +112,10 @@ def exposed_networks(
 
 
 def offset_of(sensor: Sensor, full_scale: float) -> float:
-    """Return the pixel value of the dark.
+    """Return the pixel value that a sensor stores without light.
 
     Args:
-        sensor: the sensor, of which the middle of each range is used.
+        sensor: the sensor's profile. If it states ranges, the middle of each is used.
         full_scale: the pixel value that is the sensor's largest digital number.
     """
     instrument = sensor.nominal()
@@ -115,12 +129,14 @@ def consistency_steps(
     tiling: Tiling,
     full_scale: float,
 ) -> tuple[tuple[Consistency | None, ...], str]:
-    """Build the consistency step, one for all bands or one for each.
+    """Build the consistency step of a run, which makes the result agree with the raw image at low
+    spatial frequencies: one step for all bands, or one for each.
 
     Args:
-        around: the steps that are used.
-        sensors: the sensor of each band. The sensor named "blind" is unknown.
-        raster: the image, whose bands set the order.
+        around: the steps that the user chooses, of which this function uses `consistency`.
+        sensors: the sensor by the name of the band; a sensor for all bands has the key "". The
+            sensor named "blind" is unknown.
+        raster: the description of the image, whose bands set the order.
         tiling: the network's tiling geometry.
         full_scale: the pixel value that is the largest digital number of a sensor.
 
@@ -144,18 +160,18 @@ def consistency_steps(
 
 
 def keeps_pixels(tiling: Tiling) -> bool:
-    """Return True if a network returns one pixel of the same band for each pixel.
-
-    The consistency step compares both pixel by pixel.
+    """Return True if a network with this tiling geometry returns one pixel of the same band for
+    each pixel of the image. The consistency step needs that, because it compares pixel by pixel.
     """
     return tiling.scale == 1 and tiling.channels_in == tiling.channels_out
 
 
 def step_for(sensor: Sensor, full_scale: float) -> Consistency:
-    """Build the consistency step for the middle of a sensor's ranges and its reference.
+    """Build the consistency step of a band.
 
     Args:
-        sensor: the sensor that acquired the image.
+        sensor: the profile of the sensor that acquired the image, which also states the reference
+            sensor that the restoration aims at. The middle of each of their ranges is used.
         full_scale: the pixel value that is the sensor's largest digital number.
     """
     return Consistency.of(sensor.nominal(), sensor.reference.nominal(), full_scale)

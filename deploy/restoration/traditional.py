@@ -52,7 +52,7 @@ class TraditionalRestoration(Restoration):
     pipelines: tuple[TraditionalPipeline, ...]
 
     def ticks(self, done_px: int) -> int:
-        """Return the number of progress ticks from row `done_px` on: one for each row."""
+        """Return the number of rows of pixels from row `done_px` on, one progress tick each."""
         return self.source.raster.height_px - done_px
 
     def rows(
@@ -65,6 +65,9 @@ class TraditionalRestoration(Restoration):
         Args:
             done_px: always 0, because a traditional restoration cannot be resumed.
             tick: called with the number of rows of each finished strip.
+
+        Yields:
+            The next restored strip of all bands, as it is stored.
         """
         height_px = self.source.raster.height_px
         by_band = [
@@ -79,10 +82,12 @@ class TraditionalRestoration(Restoration):
             top += rows_px
 
     def watch_memory(self, done: int, total: int) -> None:
-        """Check nothing: `prepare` knows the memory of a strip before the first one."""
+        """Check nothing, because `prepare` has checked the memory that every strip needs."""
 
     def figures(self, tally: Tally) -> dict[str, Figure]:
-        """Return the figures of a run from its tally."""
+        """Return the figures of a finished run by name: those of its tally, which counts and sums
+        raw and restored pixels.
+        """
         return dict(tally.figures)
 
     def _to_dn(self, band: int) -> np.float32:
@@ -90,7 +95,17 @@ class TraditionalRestoration(Restoration):
         return np.float32(self.pipelines[band].degraded.max_dn / self.scale.value)
 
     def read(self, band: int) -> Iterator[Tensor]:
-        """Read strips (rows, width) float32 of digital numbers, NaN where they are missing."""
+        """Read one band of the raw image from the top, `STRIP_PX` rows at a time.
+
+        Args:
+            band: the number of the band, from 0.
+
+        Yields:
+            Strips (rows, width) float32 in digital numbers of the sensor, NaN where missing.
+
+        Raises:
+            ImageError: a pixel is negative, infinite, or above an assumed full scale.
+        """
         source = self.source
         for start, stop in strips(source.raster.height_px, STRIP_PX):
             stored = source.read(start, stop)
@@ -104,10 +119,10 @@ class TraditionalRestoration(Restoration):
             yield torch.from_numpy(dn)
 
     def fitted(self) -> "TraditionalRestoration":
-        """Return the restoration with the regularisation derived for each band.
+        """Return this restoration with the strength of the deconvolution fitted to the image.
 
-        The regularisation is the Wiener optimum of the whole image, so one pass reads all strips.
-        It is much quicker than the restoration.
+        The regularisation is the Wiener optimum of each band of the whole image, so this reads all
+        strips once. It is much quicker than the restoration.
         """
         with steps("measuring noise and contrast", len(self.pipelines) * self.ticks(0)) as bar:
             pipelines = [
@@ -147,17 +162,18 @@ def _counted(strips_read: Iterator[Tensor], bar: Steps) -> Iterator[Tensor]:
 
 @dataclass(frozen=True)
 class TraditionalMethod:
-    """The traditional pipeline, as a method that can restore images.
+    """The traditional pipeline (denoising by NL-Bayes, then deconvolution) as a method that can
+    restore images.
 
     Attributes:
-        quality: fast, standard or best.
+        quality: 'fast', 'standard' or 'best', from quick to thorough.
     """
 
     quality: str = "standard"
 
     @property
     def engine(self) -> Engine:
-        """The engine, which is this process."""
+        """The default engine, because the pipeline runs no network and uses this process alone."""
         return Engine()
 
     def prepare(
@@ -167,7 +183,9 @@ class TraditionalMethod:
         name: str,
         cluster: Cluster | None = None,  # noqa: ARG002
     ) -> TraditionalRestoration:
-        """Prepare the pipeline to restore an image; see `prepare.Pipeline.prepare`."""
+        """Prepare the restoration of an image by the pipeline, as `prepare.Pipeline.prepare`
+        describes. The regularisation is fitted here, which reads the whole image.
+        """
         raster = source.raster
         sensors = in_order(reading.sensors, raster)
         sensors *= raster.bands // len(sensors)

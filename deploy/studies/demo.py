@@ -68,7 +68,17 @@ NOTES = (
 
 
 def quality_rows(images: Mapping[str, np.ndarray], pair: Pair, degraded: np.ndarray) -> list[Row]:
-    """Return PSNR and SSIM of each image (H, W) against the reference of a simulated pair."""
+    """Compute PSNR and SSIM of restored images against the reference of a simulated pair.
+
+    Args:
+        images: digital numbers (H, W) of each image, by the name of its row.
+        pair: the simulated pair, whose reference is the truth.
+        degraded: digital numbers (H, W) of the degraded image. Where it clips, no pixel counts in
+            PSNR.
+
+    Returns:
+        A row of the table 'quality' for each image.
+    """
     rows = []
     for name, dn in images.items():
         psnr = measured(fidelity_db(dn, pair.reference, degraded), "dB", "simulated pair")
@@ -78,7 +88,17 @@ def quality_rows(images: Mapping[str, np.ndarray], pair: Pair, degraded: np.ndar
 
 
 def load_sensors(sensor: SensorLike = SENSOR) -> tuple[Sensor, Sensor]:
-    """Return the sensor that the demo simulates, and the reference sensor that it aims at."""
+    """Load the sensor that the demonstration simulates, and the reference sensor it restores to.
+
+    Args:
+        sensor: the sensor: a `Sensor`, a name or a .toml file.
+
+    Returns:
+        The sensor and its reference.
+
+    Raises:
+        OptionError: the sensor does not have 12 bits.
+    """
     degraded = Sensor.load(sensor)
     if degraded.nominal().bits != BITS:
         raise OptionError(
@@ -91,14 +111,22 @@ def load_sensors(sensor: SensorLike = SENSOR) -> tuple[Sensor, Sensor]:
 def read_input(
     image: Path | None, seed: int, sensors: tuple[Sensor, Sensor], full_scale: float | None = None
 ) -> tuple[np.ndarray, Pair | None]:
-    """Return the degraded image (H, W) in digital numbers, and its pair if it is simulated.
+    """Read or simulate the degraded image that the demonstration restores.
 
     Args:
-        image: a photograph as a scene (8 bits) or a raw acquisition (mono, up to 12 bits); a
-            synthetic scene if None.
+        image: the file of a photograph (8 bits), which is the scene that the sensors acquire, or of
+            a raw image of one band (up to 12 bits); None draws a synthetic scene.
         seed: the seed of every random draw.
-        sensors: the sensors that acquire a scene.
-        full_scale: pixel value that is full scale. If it is given, any image is a raw acquisition.
+        sensors: the sensor that acquires the scene, and the reference sensor.
+        full_scale: the pixel value that is full scale. With it any image is taken as a raw image;
+            None takes a file of 8 bits as a photograph.
+
+    Returns:
+        The degraded image (H, W) in digital numbers, and the pair of degraded and reference image
+        if they were simulated, else None.
+
+    Raises:
+        ImageError: the image cannot be read, or its full scale is ambiguous.
     """
     degraded, reference = (profile.nominal() for profile in sensors)
     ratio = int(sensors[0].oversampling.low)
@@ -115,8 +143,15 @@ def read_input(
 
 
 def bench_tables(model: Network, dn: np.ndarray, sensors: tuple[Sensor, Sensor]) -> list[Section]:
-    """Return the speed for this image, for the paper's swath next to its published rows, and for
-    that swath on every board.
+    """Predict and measure the time and power of a restoration, in three tables.
+
+    The tables are on this image, on a swath of the size that the paper restores (with the paper's
+    published rows), and on this swath with each board's DPU.
+
+    Args:
+        model: the INT8 network.
+        dn: digital numbers (H, W) of this image, on which the traditional pipeline is timed.
+        sensors: the sensor of the image and the reference sensor, for the traditional pipeline.
     """
     dpu = load_dpu(DEFAULT_TARGET)
     halo_px = model.tiling.halo_px
@@ -148,8 +183,14 @@ def bench_tables(model: Network, dn: np.ndarray, sensors: tuple[Sensor, Sensor])
 
 
 def pictures_of(images: dict[str, np.ndarray], out: Path) -> list[Picture]:
-    """Return crops of several (H, W) images side by side, and the whole INT8 result. The crops are
-    also written as before-after.png.
+    """Draw crops of the compared images side by side, and the image that the INT8 network restored.
+
+    The crops are also written to before-after.png.
+
+    Args:
+        images: digital numbers (H, W) of each image, by its name; `INPUT` and `INT8` are among
+            them.
+        out: the folder of before-after.png.
     """
     side = min(CROP_PX, *images[INPUT].shape)
     stretch = stretch_of(images[INPUT])
@@ -169,7 +210,15 @@ def pictures_of(images: dict[str, np.ndarray], out: Path) -> list[Picture]:
 
 
 def headline(bench: Sequence[Row], quality: Sequence[Row], placement: Placement) -> str:
-    """Return one sentence: whether the network fits, how fast it is, and at what quality."""
+    """Return the sentence at the top of the page: if the network fits the DPU, its predicted time
+    compared with the traditional pipeline's, and its PSNR.
+
+    Args:
+        bench: the table on the time for this image; its first row is the traditional pipeline.
+        quality: the table on quality, from the degraded input to the INT8 network; empty if there
+            is no reference.
+        placement: the parts of the network that the DPU runs.
+    """
     latency = next(row for row in bench if "whole tiles" in row.name).figures["latency"]
     cpu = bench[0].figures["latency"]
     board = DEFAULT_TARGET.upper()

@@ -44,16 +44,20 @@ def make_network(
     resume: bool,
     device: str,
 ) -> None:
-    """Run a recipe to its end.
+    """Train a network by its recipe, and write its weights, its INT8 file and its model card.
 
     Args:
         name: the name of the network, for its files and its model card.
-        recipe: the recipe of the network.
-        toml: its text, for the model card.
-        images: folders of photographs.
-        out: the output folder.
+        recipe: all parameters of the training, in one or several stages.
+        toml: the text of the recipe's file, for the model card.
+        images: folders of photographs to train on.
+        out: the output folder, with a folder for each stage.
         resume: True to continue the run in the folder; otherwise it must contain no run.
-        device: cpu or cuda.
+        device: the device of torch, 'cpu' or 'cuda'.
+
+    Raises:
+        OptionError: the folder contains a run, or one that cannot be continued with this recipe.
+        ModelError: the training diverges, or weights do not fit the recipe.
     """
     weights = shipped_weights(recipe.start) if recipe.start else None
     for number, stage in enumerate(recipe.stages, 1):
@@ -83,8 +87,19 @@ def stage_run(
     start: Path | None,
     device: str,
 ) -> Run:
-    """Return the run of a stage. Create the INT8 file whose roundings it trains with, if it does
-    not exist.
+    """Return the options of the training run of one stage of a recipe.
+
+    If the stage trains with the rounding of INT8, this also writes the INT8 file of the weights
+    that the stage begins with, unless it exists.
+
+    Args:
+        recipe: the recipe of the network.
+        number: the number of the stage, from 1.
+        stage: the stage.
+        images: folders of photographs.
+        out: the output folder of the recipe, in which the stage gets the folder NUMBER-NAME.
+        start: the weights that the stage begins with; None draws them.
+        device: the device of torch, 'cpu' or 'cuda'.
     """
     folder = out / f"{number}-{stage.name}"
     rounding = None
@@ -132,7 +147,16 @@ def stage_run(
 
 
 def model_card(name: str, recipe: NetworkRecipe, toml: str, images: Sequence[Path]) -> str:
-    """Return the text of a network's card: its recipe, its data, and the machine it was made on."""
+    """Return the Markdown text of the model card of a trained network, which states its recipe, its
+    data, and the machine that trained it.
+
+    Args:
+        name: the name of the network.
+        recipe: the recipe of the network.
+        toml: the text of the recipe's file, which the card quotes.
+        images: folders of the photographs that it was trained on; their names and content enter a
+            digest.
+    """
     variant = VARIANTS[recipe.variant]
     files = list(chain.from_iterable(map(list_images, images)))
     # Sorted by name, so that the digest does not depend on the order of the folders.
@@ -167,7 +191,9 @@ The recipe:
 
 
 def described(variant: Variant) -> str:
-    """Return blocks, features, resolution and parameters in words."""
+    """Describe the size of a network in words for its model card: blocks, features, resolution and
+    number of parameters.
+    """
     parameters = sum(math.prod(shape) for shape in variant.banked_shapes.values())
     at = f" at 1/{variant.scale} of the resolution" if variant.scale > 1 else ""
     return (

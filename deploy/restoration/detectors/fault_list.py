@@ -33,12 +33,12 @@ digits.
 
 @dataclass(frozen=True, order=True)
 class Fault:
-    """A faulty pixel, column or row.
+    """One fault of an image's detectors: a pixel, a whole column or a whole row.
 
     Attributes:
-        column: the column of the image, from 0; -1 for all of a row.
-        row: the row of the image, from 0; -1 for all of a column.
-        band: from 1; 0 for all bands.
+        column: the column of the image, counted from 0; -1 if the fault is a whole row.
+        row: the row of the image, counted from 0; -1 if the fault is a whole column.
+        band: the band of the image, counted from 1; 0 for all bands.
     """
 
     column: int
@@ -47,31 +47,35 @@ class Fault:
 
     @property
     def line(self) -> str:
-        """The line in a file that describes this fault."""
+        """The line of a CSV list that describes this fault, such as "17,*" for column 17."""
         numbers = [ALL if place < 0 else str(place) for place in (self.column, self.row)]
         return ",".join([*numbers, *([str(self.band)] if self.band else [])])
 
 
 @dataclass(frozen=True)
 class FaultList:
-    """The faults of an image's detectors, sorted and without duplicates."""
+    """The list of an image's faulty detectors, as a file states it or as they were detected.
+
+    Attributes:
+        faults: the faults, sorted and without duplicates; empty for none.
+    """
 
     faults: tuple[Fault, ...]
 
     @property
     def text(self) -> str:
-        """The list as the content of a file."""
+        """The list as the content of a CSV file, with a header line."""
         header = HEADER if any(fault.band for fault in self.faults) else HEADER[:2]
         return "\n".join([",".join(header), *(fault.line for fault in self.faults), ""])
 
     @property
     def sha256(self) -> str:
-        """The hex digest of the content."""
+        """The SHA-256 of `text` as hex. A run is resumed only if it is the same."""
         return hashlib.sha256(self.text.encode()).hexdigest()
 
     @property
     def words(self) -> str:
-        """The number of pixels, columns and rows, in words."""
+        """The number of faults of each kind in words, such as "3 pixels, 1 column", or "none"."""
         columns = sum(fault.row < 0 for fault in self.faults)
         rows = sum(fault.column < 0 for fault in self.faults)
         counts = {"pixel": len(self.faults) - columns - rows, "column": columns, "row": rows}
@@ -79,8 +83,15 @@ class FaultList:
         return ", ".join(words) or "none"
 
     def mask(self, raster: Raster, start: int, stop: int) -> np.ndarray:
-        """Return a mask of the faulty pixels in rows `start` to `stop` (excluded), bool (bands,
-        rows, width).
+        """Return a mask of the faulty pixels in rows `start` to `stop` (excluded) of an image.
+
+        Args:
+            raster: the description of the image, which states the number of bands and the width.
+            start: the first row.
+            stop: the row after the last one.
+
+        Returns:
+            The mask, bool (bands, rows, width).
         """
         flags = np.zeros((raster.bands, stop - start, raster.width_px), bool)
         columns, rows, bands = self._numbers.T
@@ -100,16 +111,16 @@ class FaultList:
 
 
 def counted(count: int, name: str) -> str:
-    """Return a count and a noun, which gets an "s" unless the count is 1."""
+    """Return a count and a noun, such as "3 pixels". The noun has an "s" if the count exceeds 1."""
     return f"{count} {name}{'s' if count > 1 else ''}"
 
 
 def found_list_path(out: Path, source: str) -> Path | None:
-    """Return where the list of detected faults of `out` is written, next to the restored image.
+    """Return the path at which a run writes the faults that it detected, next to its result.
 
     Args:
-        out: the restored image.
-        source: the value of `fix_detectors`.
+        out: the path of the restored image.
+        source: the value of the option `fix_detectors`.
 
     Returns:
         The path of the CSV file; None unless `source` is "found", because only then faults are
@@ -119,11 +130,15 @@ def found_list_path(out: Path, source: str) -> Path | None:
 
 
 def read_list(path: Path, raster: Raster) -> FaultList:
-    """Read a list of faults, and raise an error if one does not fit the image.
+    """Read the list of faulty detectors that a user gives for an image.
 
     Args:
-        path: the path of the file.
-        raster: the raster of the image.
+        path: the path of the CSV file.
+        raster: the description of the image.
+
+    Raises:
+        OptionError: the file cannot be read or lists no fault, or a line is no fault or lies
+            outside the image.
     """
     reason = "lists none"
     lines = list[str]()

@@ -48,12 +48,17 @@ along a column, diagonal.
 
 
 def faults_of(source: Source, source_name: str, name: str) -> FaultList:
-    """Return the faults that `restore --fix-detectors` specifies.
+    """Return the faults of detectors that a run replaces, and log their number.
 
     Args:
         source: the image.
-        source_name: 'found', or the file of a list; empty for none.
+        source_name: the value of the option `fix_detectors`: 'found' to detect faults in the image,
+            the path of a list of faults, or empty to replace none.
         name: the name of the image, for messages.
+
+    Raises:
+        OptionError: the list cannot be read, or does not fit the image.
+        ImageError: more than 1 % of the pixels look faulty as single pixels.
     """
     if not source_name:
         return FaultList(())
@@ -68,19 +73,31 @@ def faults_of(source: Source, source_name: str, name: str) -> FaultList:
 
 
 def fixed(source: Source, faults: FaultList) -> Source:
-    """Return an image with its faults replaced, or the image itself if there are none."""
+    """Return the image as it is read with its faulty pixels replaced, or the image itself.
+
+    Args:
+        source: the image.
+        faults: the faults to replace; if the list is empty, `source` is returned.
+    """
     return FixedSource(source, faults) if faults.faults else source
 
 
 def find_faults(source: Source, name: str) -> FaultList:
-    """Find dead and wrong pixels, columns and rows in all rows of an image.
+    """Detect the faulty pixels, columns and rows of an image.
 
-    Columns, and rows that are off but not dead, are detected in the strips that `look_at_detectors`
+    Pixels, and rows that are dead (constant where their neighbours vary), are searched in the whole
+    image. Columns, and rows with a wrong gain, are detected in the strips that `look_at_detectors`
     reads.
 
     Args:
         source: the image.
         name: the name of the image, for messages.
+
+    Returns:
+        The faults. A pixel of a faulty column or row is not listed again.
+
+    Raises:
+        ImageError: more than 1 % of the pixels look faulty as single pixels.
     """
     raster = source.raster
     lines = set[Fault]()
@@ -108,12 +125,19 @@ def find_faults(source: Source, name: str) -> FaultList:
 
 
 def band_number(band: int, raster: Raster) -> int:
-    """Return the number of a band in a list, or 0 if the image has only one band."""
+    """Return the number by which a list of faults names a band: from 1, or 0 for the only band.
+
+    Args:
+        band: the index of the band, from 0.
+        raster: the description of the image.
+    """
     return band + 1 if raster.bands > 1 else 0
 
 
 def _replaced(stripes: Stripes) -> list[int]:
-    """Return the dead lines, and those whose gain error exceeds WRONG_GAIN."""
+    """Return the numbers of the dead columns or rows, and of those with a gain error above
+    WRONG_GAIN.
+    """
     return [*stripes.dead, *(line.index for line in stripes.off if abs(line.gain) > WRONG_GAIN)]
 
 
@@ -142,6 +166,11 @@ class FixedSource:
     within `REACH_PX`. The shorter distance has the larger weight. If neither direction has a valid
     pixel, the diagonals are used. Without a valid pixel in reach the pixel stays, and so does a
     missing one.
+
+    Attributes:
+        faults: the faults whose pixels are replaced.
+        raster: the description of the image.
+        files: the files that the image is read from; empty for an array.
     """
 
     def __init__(self, source: Source, faults: FaultList) -> None:
@@ -151,8 +180,10 @@ class FixedSource:
         self.files = source.files
 
     def read(self, start: int, stop: int) -> np.ndarray:
-        """Read rows `start` to `stop` (excluded) of every band, (bands, rows, width), masked where
-        the image is.
+        """Read rows `start` to `stop` (excluded) of every band, with faulty pixels replaced.
+
+        Returns:
+            The pixels (bands, rows, width) as stored, in a masked array if the image has a mask.
         """
         raster = self.raster
         if not self.faults.mask(raster, start, stop).any():
@@ -174,12 +205,12 @@ class FixedSource:
         return pixels[:, within]
 
     def read_mask(self, start: int, stop: int) -> np.ndarray:
-        """Read the same rows of the image's mask or alpha."""
+        """Read rows `start` to `stop` (excluded) of the image's mask or alpha, (rows, width)."""
         return self._source.read_mask(start, stop)
 
     def held_bytes(self, rows_px: int) -> int:
-        """Return the memory that a read of `rows_px` rows needs: the image's own, and the rows
-        around with their flags.
+        """Return the bytes of memory that reading `rows_px` rows at a time needs in addition to
+        these rows: for decoding the image, and for the rows around them with their flags.
         """
         raster = self.raster
         row_bytes = raster.bands * raster.width_px * (raster.dtype.itemsize + 4)
@@ -191,13 +222,16 @@ class FixedSource:
 def replace_pixels(
     plane: np.ndarray, bad: np.ndarray, sound: np.ndarray, nodata: float | None = None
 ) -> None:
-    """Replace pixels of a plane in place.
+    """Replace faulty pixels of one band in place, by interpolation between valid neighbours.
+
+    A faulty pixel without a valid neighbour within `REACH_PX` stays unchanged.
 
     Args:
-        plane: (h, w).
-        bad: mask of the pixels to replace, bool.
-        sound: mask of the valid pixels to interpolate from, bool.
-        nodata: a value that no replaced pixel may take; None for none.
+        plane: the pixels (h, w), which this function changes.
+        bad: mask (h, w) of the pixels to replace, bool.
+        sound: mask (h, w) of the valid pixels to interpolate from, bool.
+        nodata: the value that marks missing pixels, which no replaced pixel may take; None if there
+            is no such value.
     """
     places = np.argwhere(bad)
     total = np.zeros(len(places))
@@ -236,8 +270,8 @@ def replace_pixels(
 def _nearest(
     plane: np.ndarray, sound: np.ndarray, places: np.ndarray, side: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the value of the nearest valid pixel to one side of each place, and its distance,
-    which is inf if there is none.
+    """Return the value of the nearest valid pixel to one side of each of n places, (n,), and its
+    distance in steps, (n,), which is inf if there is none.
     """
     values = np.zeros(len(places))
     distances = np.full(len(places), np.inf)

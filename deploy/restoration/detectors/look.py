@@ -52,14 +52,15 @@ pixels.
 
 @dataclass(frozen=True)
 class BandFaults:
-    """The faults found in one band.
+    """The faults of detectors that were found in strips of one band of an image.
 
     Attributes:
-        columns: the columns of the image, whose lines have the image's numbers.
-        rows: likewise, of the rows that were checked.
-        patterns: the patterns of period 2.
-        pixels: row and column (n, 2) of single wrong pixels among those that were checked.
-        looked_px: the number of pixels that were checked.
+        columns: the columns with a wrong gain and the dead ones, by their number in the image.
+        rows: the rows with a wrong gain and the dead ones among those in the strips, by their
+            number in the image.
+        patterns: the fixed patterns that repeat after two pixels, such as a checkerboard.
+        pixels: row and column in the image, (n, 2), of single wrong pixels in the strips.
+        looked_px: the number of pixels in the strips that are not missing.
     """
 
     columns: Stripes
@@ -70,11 +71,15 @@ class BandFaults:
 
 
 def look_at_detectors(source: Source, full_scale: float = np.inf) -> tuple[BandFaults, ...]:
-    """Detect faults of detectors in strips of each band.
+    """Detect faults of detectors in strips of an image that are spread from top to bottom.
 
     Args:
         source: the image.
-        full_scale: the pixel value at and above which a pixel is not a measurement.
+        full_scale: the pixel value at and above which a pixel is saturated and does not count; by
+            default all pixels count.
+
+    Returns:
+        The faults of each band, in the order of the bands.
     """
     raster = source.raster
     measurements = [_Measurements(step) for step in value_steps(source)]
@@ -88,7 +93,12 @@ def look_at_detectors(source: Source, full_scale: float = np.inf) -> tuple[BandF
 
 
 def as_floats(raster: Raster, stored: np.ndarray) -> np.ndarray:
-    """Return stored pixels as float32, with NaN where they are missing or not finite."""
+    """Convert pixels as stored to float32, with NaN where they are missing or not finite.
+
+    Args:
+        raster: the description of the image, which states how missing pixels are marked.
+        stored: pixels (bands, h, w) of the image, masked or not.
+    """
     with np.errstate(over="ignore"):
         pixels = np.ma.getdata(stored).astype(np.float32)
     if raster.dtype.kind == "f":
@@ -99,8 +109,11 @@ def as_floats(raster: Raster, stored: np.ndarray) -> np.ndarray:
 
 
 def value_steps(source: Source) -> list[float]:
-    """Return the step between the values of each band, 0 for floats. It is 64 for a 10-bit image
-    stored in 16 bits.
+    """Return the step between the pixel values of each band: the largest integer that divides all
+    of them in some rows in the middle.
+
+    The step is 64 if the file stores values of 10 bits as multiples of 64 in 16 bits, usually 1 for
+    other integers, and 0 for floats.
     """
     raster = source.raster
     if raster.dtype.kind == "f":
@@ -138,10 +151,10 @@ class _Measurements:
         """Measure a strip.
 
         Args:
-            top: its first row.
-            within: rows of it to be checked; those around are for comparison.
+            top: the row of the image at which `pixels` begins.
+            within: the rows of `pixels` that are checked; the rows around are for comparison.
             pixels: (h, w), NaN where they are missing.
-            full_scale: the value at and above which a pixel is not a measurement.
+            full_scale: the value at and above which a pixel is saturated and does not count.
         """
         # The converter clips at 0 and at full scale, where a pixel no longer follows its gain.
         valid = (pixels > 0) & (pixels < full_scale)
@@ -191,11 +204,14 @@ NAMED = 3
 
 
 def warn_of_detectors(source: Source, full_scale: float) -> Mapping[str, Figure]:
-    """Detect faults of detectors, log a warning for each kind, and return the figures.
+    """Detect faults of detectors in strips of an image, and log a warning for each kind of fault.
 
     Args:
         source: the image.
-        full_scale: the pixel value at and above which a pixel is not a measurement.
+        full_scale: the pixel value at and above which a pixel is saturated and does not count.
+
+    Returns:
+        The figures of the faults by name, for a row of results.
     """
     bands = look_at_detectors(source, full_scale)
     for sentence in sentences(bands):
@@ -204,7 +220,11 @@ def warn_of_detectors(source: Source, full_scale: float) -> Mapping[str, Figure]
 
 
 def sentences(bands: Sequence[BandFaults]) -> list[str]:
-    """Return a sentence for each kind of fault in each band."""
+    """Return the warnings on faults of detectors, one for each kind of fault in each band.
+
+    Args:
+        bands: the faults of each band, in the order of the bands.
+    """
     messages = []
     for number, band in enumerate(bands, 1):
         where = f"band {number}: " if len(bands) > 1 else ""
@@ -267,7 +287,11 @@ def _some(places: Sequence[str]) -> str:
 
 
 def figures(bands: Sequence[BandFaults]) -> Mapping[str, Figure]:
-    """Return the figures of each band for a row of results."""
+    """Return the figures of the faults of detectors by name, for a row of results.
+
+    Args:
+        bands: the faults of each band. Of several bands, each name begins with the band's number.
+    """
     result = dict[str, Figure]()
     for number, band in enumerate(bands, 1):
         where = f"band {number}: " if len(bands) > 1 else ""

@@ -39,11 +39,12 @@ ACROSS = 4
 
 @dataclass(frozen=True)
 class SensorCheck:
-    """The result of comparing an image with its sensor.
+    """The result of comparing an image with the profile of its sensor.
 
     Attributes:
-        figures: measured SNR and MTF, each with its interval.
-        warnings: one sentence for each contradiction of the profile.
+        figures: the SNR and the MTF measured in the image, by name, each with its interval or the
+            reason why it cannot be measured; empty if there was no sensor to compare with.
+        warnings: one sentence for each contradiction between image and profile.
     """
 
     figures: Mapping[str, Figure] = field(default_factory=dict)
@@ -51,18 +52,20 @@ class SensorCheck:
 
     @property
     def text(self) -> dict[str, str]:
-        """The result of the check as the text of a row of results."""
+        """The result in words, under the key 'sensor check', for a row of results; empty if there
+        was no sensor to compare with.
+        """
         is_measured = any(figure.value is not None for figure in self.figures.values())
         words = "; ".join(self.warnings) or ("agrees" if is_measured else "not measurable")
         return {"sensor check": words} if self.figures else {}
 
     def report(self, name: str, sensor: str, strict: bool) -> None:
-        """Log a warning for each contradiction.
+        """Log a warning for each contradiction between the image and its sensor.
 
         Args:
             name: the name of the image, for messages.
-            sensor: its profile's name.
-            strict: if True, a contradiction is an error instead.
+            sensor: the name of the sensor's profile, for messages.
+            strict: True to raise an error instead of logging warnings.
 
         Raises:
             ImageError: there is a contradiction, and `strict` is True.
@@ -84,14 +87,15 @@ def checked_sensor(
     name: str,
     strict: bool,
 ) -> SensorCheck:
-    """Compare an image with the sensor that a user names, and warn if it contradicts it.
+    """Compare an image with the sensors that a user names, and warn of each contradiction.
 
     Args:
         source: the image.
-        sensors: by band, or under "" if one is for all; empty or blind if none is known.
+        sensors: the sensor by the name of the band; a sensor for all bands has the key "". If the
+            mapping is empty or all sensors are named "blind", nothing is compared.
         full_scale: the pixel value that is the sensors' largest digital number.
         name: the name of the image, for messages.
-        strict: if True, a contradiction is an error instead of a warning.
+        strict: True to raise an error for a contradiction instead of a warning.
 
     Raises:
         ImageError: there is a contradiction, and `strict` is True.
@@ -106,11 +110,11 @@ def checked_sensor(
 
 
 def check_source(source: Source, sensors: Sequence[Sensor], full_scale: float) -> SensorCheck:
-    """Compare an image with its sensor, band by band.
+    """Compare the noise and blur of each band of an image with the band's sensor.
 
     Args:
         source: the image.
-        sensors: one for all bands, or one for each.
+        sensors: one sensor for all bands, or one for each in the order of the bands.
         full_scale: the pixel value that is the sensors' largest digital number.
     """
     checks = [
@@ -128,12 +132,12 @@ def check_source(source: Source, sensors: Sequence[Sensor], full_scale: float) -
 
 
 def check_windows(windows: Sequence[np.ndarray], sensor: Sensor, full_scale: float) -> SensorCheck:
-    """Compare windows of one band with a sensor.
+    """Compare the noise and blur of one band, measured in windows of it, with a sensor's profile.
 
     Args:
-        windows: (h, w) each, raw values; 0 where pixels are missing.
+        windows: parts of the band, raw values (h, w) each, 0 where pixels are missing.
         sensor: the profile. If it states ranges, every value within them agrees with it.
-        full_scale: the value that is the sensor's largest digital number.
+        full_scale: the pixel value that is the sensor's largest digital number.
     """
     step = integer_step(windows)
     if step is None:
@@ -162,12 +166,24 @@ def check_windows(windows: Sequence[np.ndarray], sensor: Sensor, full_scale: flo
 
 
 def band_windows(source: Source) -> list[list[np.ndarray]]:
-    """Return windows (h, w) of each band, spread evenly over an image; missing pixels are 0."""
+    """Read windows that are spread evenly over an image, without overlap.
+
+    Returns:
+        For each band its windows, raw values (h, w) each, 0 where pixels are missing. All bands
+        have the same windows.
+    """
     return [list(windows) for windows in zip(*_windows(source), strict=True)]
 
 
 def integer_step(windows: Sequence[np.ndarray]) -> int | None:
-    """Return the largest integer that divides all pixels, or None if they are not integers."""
+    """Return the step between pixel values: the largest integer that divides all pixels.
+
+    Args:
+        windows: parts of one band, (h, w) each.
+
+    Returns:
+        The step; 1 if all pixels are 0, None if a pixel is not an integer.
+    """
     if any(window.dtype.kind == "f" for window in windows) and not all(
         (np.isfinite(window) & (window == np.rint(window))).all() for window in windows
     ):

@@ -39,16 +39,21 @@ SNR = "measured SNR"
 
 
 def mtf_name(axis: str) -> str:
-    """Return the name of the figure of the MTF along an axis."""
+    """Return the name under which results show the measured MTF.
+
+    Args:
+        axis: "across" or "along" the track.
+    """
     return f"measured MTF {axis}"
 
 
 class StatedSensor(NamedTuple):
-    """The facts of a profile, in units of the image.
+    """The noise and blur that a sensor's profile states, in the pixel values of one image.
 
     Attributes:
-        instruments: the nominal sensor, and others drawn from the profile's ranges.
-        unit: pixel values per digital number.
+        instruments: the nominal sensor first, then sensors drawn from the profile's ranges; the
+            nominal one alone if the profile states no ranges.
+        unit: the pixel value of one digital number of the sensor.
     """
 
     instruments: Sequence[Instrument]
@@ -56,7 +61,12 @@ class StatedSensor(NamedTuple):
 
     @classmethod
     def of(cls, sensor: Sensor, clipped_at: float) -> "StatedSensor":
-        """Return the facts of a profile for an image whose full scale is `clipped_at`."""
+        """Prepare a profile for comparison with an image.
+
+        Args:
+            sensor: the sensor's profile.
+            clipped_at: the pixel value that is the sensor's largest digital number.
+        """
         generator = np.random.default_rng(SEED)
         nominal = sensor.nominal()
         samples = (sensor.draw(generator) for _ in range(DRAWS))
@@ -64,24 +74,51 @@ class StatedSensor(NamedTuple):
         return cls([nominal, *others], clipped_at / nominal.max_dn)
 
     def variances(self, value: np.ndarray | float) -> np.ndarray:
-        """Return the variance of the noise at pixel values, without rounding, of each instrument:
-        (I, ...).
+        """Return the variance of the noise of each instrument, without that of rounding.
+
+        Args:
+            value: pixel values of any shape.
+
+        Returns:
+            The variances in squared pixel values, with one more axis in front: the instruments.
         """
         values = np.asarray(value, np.float64)
         return np.stack([self.variance(instrument, values) for instrument in self.instruments])
 
     def variance(self, sensor: Instrument, value: np.ndarray) -> np.ndarray:
-        """Return the variance of the noise at pixel values, of one instrument."""
+        """Return the variance of the noise of one instrument, without that of rounding.
+
+        Args:
+            sensor: the instrument.
+            value: pixel values of any shape.
+
+        Returns:
+            The variances in squared pixel values, of the same shape.
+        """
         gain = sensor.gain_dn_per_radiance
         radiance = np.maximum(value / self.unit - sensor.offset_dn, 0) / gain
         return np.asarray((sensor.alpha * radiance + sensor.beta) * (gain * self.unit) ** 2)
 
     def nominal_noise(self, values: np.ndarray) -> np.ndarray:
-        """Return the variance in the pixels of the nominal sensor, including rounding."""
+        """Return the variance of the noise of the nominal sensor, rounding to integers included.
+
+        Args:
+            values: pixel values of any shape.
+
+        Returns:
+            The variances in squared pixel values, of the same shape.
+        """
         return self.variance(self.instruments[0], values) + ROUNDING
 
     def mtf(self, axis: str) -> tuple[float, float]:
-        """Return the lowest and the highest contrast at Nyquist along an axis."""
+        """Return the lowest and the highest MTF at Nyquist of the instruments.
+
+        Args:
+            axis: "across" or "along" the track.
+
+        Returns:
+            Two shares of the contrast at frequency 0.
+        """
         f = np.array([[NYQUIST]]), np.array([[0.0]])
         fx, fy = f if axis == AXES[0] else f[::-1]
         contrasts = [
@@ -93,8 +130,17 @@ class StatedSensor(NamedTuple):
 def compare_noise(
     line: NoiseModel | Refusal, blocks: Blocks, stated: StatedSensor
 ) -> tuple[Figure, list[str]]:
-    """Return the SNR in the middle of the measured levels, and a sentence if it contradicts the
-    profile.
+    """Compare the noise measured in one band of an image with that of the sensor's profile.
+
+    Args:
+        line: the noise measured as a function of the pixel value, or the reason why it cannot be
+            measured.
+        blocks: the blocks of the image in which noise was measured.
+        stated: the noise that the profile states.
+
+    Returns:
+        The SNR in the middle of the measured pixel values, and a list of one sentence if the noise
+        contradicts the profile, else an empty list.
     """
     if isinstance(line, Refusal):
         return unavailable("ratio", line.reason), _smoothed(blocks, stated)
@@ -141,10 +187,11 @@ def compare_blur(
     Args:
         axis: "across" or "along" the track.
         blur: the measured MTF along the axis, or the reason why there is none.
-        stated: what the profile states.
+        stated: the MTF that the profile states.
 
     Returns:
-        The measured MTF in %, and a sentence if it contradicts the profile, else no sentence.
+        The measured MTF in %, and a list of one sentence if it contradicts the profile, else an
+        empty list.
     """
     if isinstance(blur, Refusal):
         return unavailable("%", blur.reason), []

@@ -38,13 +38,20 @@ FILLED = 1e-9
 
 
 def restored_already(source: Source, networks: Sequence[onnx.ModelProto], full_scale: float) -> str:
-    """Return a sentence if an image without a named sensor looks restored already, else "".
+    """Return the warning that an image without a named sensor looks restored already.
+
+    An image has been denoised, and so is not raw, if its noise is far below that of the quietest
+    sensor that the networks were trained for.
 
     Args:
         source: the image.
-        networks: the networks that are to restore it. The range is known if a network states its
-            sensor, "blind" included.
-        full_scale: the pixel value that is 1.0 to them.
+        networks: the networks that are to restore the image. The sensors that they were trained for
+            are known only if each states a sensor in its metadata, "blind" included.
+        full_scale: the pixel value that is 1.0 to the networks.
+
+    Returns:
+        The warning; empty if the image looks raw, its noise cannot be measured, or the sensors are
+        not known.
     """
     if not all(metadata(network).get("sensor") for network in networks):
         return ""

@@ -28,10 +28,12 @@ Window = tuple[slice, slice, slice]
 
 
 class Tile(NamedTuple):
-    """The retained pixels of a tile, (bands, h, w), and their statistics.
+    """The restored pixels of the retained part of a tile, and their statistics.
 
-    From `Restorer.tile` the pixels are float32, NaN where a pixel is missing. From
-    `Restorer.finish` they are as stored.
+    Attributes:
+        pixels: (bands, h, w). From `Restorer.tile` they are float32, NaN where a pixel is missing;
+            from `Restorer.finish` they have the type and rounding of the output.
+        tally: counts and sums over these pixels and their raw ones.
     """
 
     pixels: np.ndarray
@@ -40,12 +42,14 @@ class Tile(NamedTuple):
 
 @dataclass(frozen=True)
 class Strip:
-    """Rows of an image from `top` on: `pixels` (bands, rows, width) as stored, and which of them
-    are missing.
+    """Rows of raw pixels of an image, which have been checked.
 
-    `missing` is bool of the same shape, or None if no pixel is missing. `above` is True if a known
-    pixel is above full scale. `left` is the first column, if the strip does not begin at the
-    image's border.
+    Attributes:
+        top: the row of the image at which the strip begins.
+        pixels: the pixels (bands, rows, width) as stored.
+        missing: mask of the missing pixels, bool of the same shape; None if none is missing.
+        above: True if a pixel that is not missing is above full scale.
+        left: the column of the image at which the strip begins; 0 for whole rows.
     """
 
     top: int
@@ -57,18 +61,20 @@ class Strip:
 
 @dataclass(frozen=True)
 class Restorer:
-    """Restores stored pixels, given a network and the description of an image.
+    """Restores the tiles of one image, with its networks and the steps around them.
 
     Attributes:
         raster: the description of the image.
-        networks: the network at its exposures; one for all groups of bands, or one for each.
-        full_scale: the pixel value that is 1.0 to the network.
-        plan: how the image is cut. Missing pixels are filled from no farther away than the halo of
-            its tiling geometry. Pixels beyond that, filled or not, do not influence a known pixel.
+        networks: the network for all groups of bands, or one for each group, with its versions for
+            higher exposures, at which dark parts are restored.
+        full_scale: the pixel value that is 1.0 to the networks.
+        plan: how the image is cut into tiles. Missing pixels are filled from pixels within the
+            network's receptive radius. Pixels beyond that do not influence a known pixel.
         name: the name of the image, for messages.
-        clips: if True, values above full scale are clipped and counted; else they are an error.
-        consistency: the consistency step, one for all bands or one for each; empty if it is
-            omitted, None for a band without it.
+        clips: True to clip and count values above full scale; False to raise an error for them.
+        consistency: the step that makes the result agree with the raw image at low spatial
+            frequencies, one for all bands or one for each; None for a band without it, empty if it
+            is omitted.
     """
 
     raster: Raster
@@ -81,17 +87,27 @@ class Restorer:
 
     @property
     def reach_px(self) -> int:
-        """The number of restored pixels that `finish` needs around those that it retains."""
+        """The number of restored pixels that `finish` needs on each side of a tile's retained part,
+        because the consistency step reads them; 0 without that step.
+        """
         return REACH_PX if self.consistency else 0
 
     @property
     def margin_px(self) -> int:
-        """The number of raw pixels that are read around the windows of tiles."""
+        """The raw pixels that are read on each side of a tile, for filling and consistency."""
         fill_px = self.raster.fill_margin_px(self.plan.radius_px)
         return max(fill_px, RAW_REACH_PX if self.consistency else 0)
 
     def read(self, source: Source, rows: Span) -> Strip:
-        """Read the strip that the tiles of one row need."""
+        """Read and check the raw rows that one row of tiles needs, with the margin around them.
+
+        Args:
+            source: the image.
+            rows: the rows that the row of tiles reads and retains.
+
+        Raises:
+            ImageError: a pixel is negative, infinite, or above full scale without `clips`.
+        """
         start = max(rows.start - self.margin_px, 0)
         stop = min(rows.stop + self.margin_px, self.raster.height_px)
         return checked_strip(
@@ -99,7 +115,21 @@ class Restorer:
         )
 
     def tile(self, strip: Strip, place: TilePlace) -> Tile:
-        """Run the network on one tile. A tile of missing pixels is not run."""
+        """Run the network on one tile, at each exposure that its pixels need.
+
+        The network does not run on a tile whose retained pixels are all missing.
+
+        Args:
+            strip: the raw rows, as `read` returns them.
+            place: the group of bands, rows and columns of the tile.
+
+        Returns:
+            The retained pixels, float32, not rounded, NaN where missing, and the number of runs.
+
+        Raises:
+            ModelError: the network returns another shape than its file states.
+            ImageError: the network returns NaN or infinite values.
+        """
         missing = self._missing(strip, place)
         if missing is not None and missing.all():
             # The network would restore nothing but what fills missing pixels.
@@ -117,14 +147,18 @@ class Restorer:
     def finish(
         self, strip: Strip, restored: np.ndarray, at: tuple[int, int], place: TilePlace
     ) -> Tile:
-        """Apply the consistency step and store the retained pixels of a tile.
+        """Apply the consistency step to a tile, and convert its pixels to the output's type.
 
         Args:
-            strip: the raw rows around the tile.
-            restored: the result of `tile`, (bands, h, w), with `reach_px` pixels around the
-                retained ones.
-            at: row and column in the image of its first pixel.
-            place: the tile, whose retained pixels are stored.
+            strip: the raw rows around the tile, as `read` returns them.
+            restored: pixels that `tile` returned for this tile and its neighbours, (bands, h, w):
+                the retained part of this tile, and `reach_px` pixels around it within the image.
+            at: the row and column of the image at which `restored` begins.
+            place: the group of bands, rows and columns of the tile.
+
+        Returns:
+            The retained pixels in the type of the output, and their counts and sums. Missing pixels
+            keep their raw value, or are nodata if the network returns other bands.
         """
         missing = self._missing(strip, place)
         window = self._retained(strip, place)
@@ -197,8 +231,8 @@ class Restorer:
         return self._bands(place), down, across
 
     def _missing(self, strip: Strip, place: TilePlace) -> np.ndarray | None:
-        """Return a mask of the retained pixels that are missing, of the restored shape, or None if
-        there are none.
+        """Return a mask of the restored pixels of a tile that are missing, (bands, h, w), or None
+        if the strip has none.
 
         If a network computes other bands from several, a pixel is missing if it is missing in any
         of them.
@@ -271,16 +305,16 @@ def checked_strip(
     clips: bool = False,
     left: int = 0,
 ) -> Strip:
-    """Check rows of an image, and return them with the mask of missing pixels.
+    """Check that raw pixels are digital numbers, and return them with the mask of missing pixels.
 
     Args:
-        raster: the image, which states how missing pixels are marked.
-        top: the first row.
-        pixels: (bands, rows, width) values as stored.
+        raster: the description of the image, which states how missing pixels are marked.
+        top: the row of the image at which `pixels` begins.
+        pixels: (bands, rows, width) values as stored, masked or not.
         full_scale: the pixel value that is the largest digital number.
         name: the name of the image, for messages.
         clips: True to accept values above full scale, which are clipped later.
-        left: the first column, if the rows do not begin at the image's border.
+        left: the column of the image at which `pixels` begins; 0 for whole rows.
 
     Raises:
         ImageError: a valid pixel is below 0, infinite, or above full scale without `clips`.
@@ -304,10 +338,15 @@ def checked_strip(
 
 
 def as_stored(raster: Raster, restored: np.ndarray, full_scale: float) -> np.ndarray:
-    """Return restored pixels of any shape in the output's type, rounded if that is an integer.
+    """Convert restored pixels to the type of the output, rounded if that is an integer type.
 
     A restored pixel that equals the nodata value would read as missing, so it gets the adjacent
     number.
+
+    Args:
+        raster: the description of the image, which states the output's type and the nodata value.
+        restored: float pixels of any shape, between 0 and full scale.
+        full_scale: the pixel value that is full scale.
     """
     result = np.rint(restored) if raster.out_dtype.kind != "f" else restored
     result = result.astype(raster.out_dtype)
@@ -326,12 +365,17 @@ def _beside(raster: Raster, nodata: float, full_scale: float) -> float:
 
 
 def fill_from_nearest(pixels: np.ndarray, missing: np.ndarray, reach_px: int) -> np.ndarray:
-    """Return (h, w) pixels where each `missing` one is a copy of a known one at most `reach_px`
-    rows and columns away.
+    """Fill missing pixels of one band with copies of known pixels nearby.
 
-    A missing pixel gets the nearest known pixel of the row, then the nearest filled one of the
-    column, or 0 if there is none in reach. A filled pixel therefore depends on nothing farther
-    away, and a window gives exactly the same result as the whole image.
+    A missing pixel gets the value of the nearest known pixel of its row, else that of the nearest
+    pixel of its column which is known or was filled along its row, else 0. A filled pixel therefore
+    depends on nothing farther away than `reach_px`, and a window gives exactly the same result as
+    the whole image.
+
+    Args:
+        pixels: (h, w) values.
+        missing: mask of the missing pixels, bool (h, w).
+        reach_px: the largest distance, in rows and in columns, of the pixel that is copied.
     """
     filled, missing = _along_rows(pixels, missing, reach_px)
     filled, missing = _along_rows(filled.T, missing.T, reach_px)

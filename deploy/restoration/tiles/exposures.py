@@ -19,10 +19,13 @@ Inner = tuple[slice, slice]
 
 
 class Exposed(NamedTuple):
-    """The retained pixels of a window, restored, and statistics of the exposures.
+    """The result of restoring the window of one tile at the exposures that its pixels need.
+
+    An exposure is a factor by which dark pixels are multiplied before the network and divided
+    afterwards.
 
     Attributes:
-        pixels: (bands, h, w) float32 in 0..full_scale, not rounded.
+        pixels: the retained pixels (bands, h, w), float32 in 0..full_scale, not rounded.
         runs: the number of runs of the network, one for each factor.
         brightened: the number of retained pixels that were restored at a factor above 1.
     """
@@ -34,13 +37,17 @@ class Exposed(NamedTuple):
 
 @dataclass(frozen=True)
 class ExposedNetwork:
-    """A network for one exposure or several.
+    """A network that restores bright pixels as they are, and dark ones at a higher exposure.
+
+    For a higher exposure, pixels are multiplied by a factor, restored by a version of the network
+    for a sensor of so much higher gain, and divided by the factor.
 
     Attributes:
-        infers: the network ready to run, by factor. The factor multiplies the gain of the sensor,
-            and 1 is among them.
-        radius_px: receptive radius, within which the brightest pixel decides.
-        offset: the pixel value of the dark.
+        infers: the versions of the network, ready to run, by the factor. The factor 1 is among
+            them, and alone if the network has no others.
+        radius_px: the network's receptive radius. The brightest pixel within it decides which
+            factor a pixel gets.
+        offset: the pixel value that the sensor stores without light, which is not multiplied.
     """
 
     infers: Mapping[int, Infer]
@@ -50,16 +57,17 @@ class ExposedNetwork:
     def restore(
         self, window: np.ndarray, full_scale: float, inner: Inner, tiling: Tiling
     ) -> Exposed:
-        """Restore a window of pixel values (bands, h, w) without missing pixels.
+        """Restore the window of one tile at each factor that its retained pixels need.
 
         Args:
-            window: the network's input.
+            window: pixel values (bands, h, w), none missing; one band if there are several factors.
             full_scale: the pixel value that is 1.0 to the network.
-            inner: the part of the window that is retained.
+            inner: the rows and columns of the window that are retained.
             tiling: the network's tiling geometry.
 
         Raises:
             ModelError: the result has another shape than the network's file states.
+            ImageError: the network returns NaN or infinite values.
         """
         scale = int(tiling.scale)
         inside = (slice(None), *(slice(part.start * scale, part.stop * scale) for part in inner))
@@ -82,7 +90,9 @@ class ExposedNetwork:
         return Exposed(pixels, len(factors), int((choice > 1).sum()))
 
     def _at(self, factor: int, image: np.ndarray, full_scale: float) -> np.ndarray:
-        """Restore the image at one factor, and return its own pixel values: (1, h, w)."""
+        """Restore an image (h, w) at one factor, and return its pixels, (1, h, w), divided by the
+        factor again.
+        """
         if factor == 1:
             return restore_window(image[None], self.infers[1], full_scale)
         offset = np.float32(self.offset)
@@ -98,14 +108,18 @@ class ExposedNetwork:
 def tiles_by_factor(
     image: np.ndarray, plan: Plan, factors: Sequence[int], full_scale: float, offset: float = 0.0
 ) -> dict[int, int]:
-    """Count the tiles of an image (H, W) that need each factor. A tile may need several.
+    """Count the tiles of an image that need each exposure, the factor by which dark pixels are
+    multiplied before the network.
 
     Args:
-        image: pixel values, none missing.
-        plan: how it is cut.
-        factors: in ascending order, 1 first.
+        image: pixel values (H, W), none missing.
+        plan: how the image is cut into tiles.
+        factors: the factors that the network offers, in ascending order, 1 first.
         full_scale: the pixel value that is 1.0 to the network.
-        offset: the pixel value of the dark.
+        offset: the pixel value that the sensor stores without light.
+
+    Returns:
+        The number of tiles by the factor. A tile that needs several factors counts for each.
     """
     pixels = np.asarray(image, np.float32)
     choice = choose_factors(pixels, factors, plan.tiling.halo_px, full_scale, offset)
@@ -118,15 +132,18 @@ def tiles_by_factor(
 
 
 def restore_window(dn: np.ndarray, infer: Infer, full_scale: float) -> np.ndarray:
-    """Run a network on a window of pixel values, and return float32 in 0..full_scale, not rounded.
+    """Run a network once on a window of pixel values.
 
     Args:
-        dn: (bands, h, w).
-        infer: the network.
-        full_scale: the pixel value that is 1.0 to it.
+        dn: pixel values (bands, h, w), none missing.
+        infer: the network, ready to run.
+        full_scale: the pixel value that is 1.0 to the network.
 
     Returns:
-        The bands and sizes of the network's result.
+        The network's result (bands', h', w'), float32 in 0..full_scale, not rounded.
+
+    Raises:
+        ImageError: the network returns NaN or infinite values.
     """
     image = np.ascontiguousarray(dn, dtype=np.float32)[None] / np.float32(full_scale)
     # Values that overflow are refused below.

@@ -20,11 +20,22 @@ from beers_deploy.restoration.tiles.engine import NAME, Restorer, Strip, checked
 
 
 def restore_lazily(bands: Any, raster: Raster, pipeline: NetworkPipeline, reading: Reading) -> Any:
-    """Return a lazy (bands, H, W) array of Dask.
+    """Return the restored image as a lazy array of Dask, (bands, H, W), one chunk for each tile.
 
-    Errors in options and model are raised at once, those in pixels when the array is computed. A
-    tile is finished from its own pixels and those that the network returned for the tiles around
-    it.
+    A chunk is computed from the pixels of its tile and those that the network returned for the
+    tiles around it. Errors in options and model are raised at once, those in pixels when the array
+    is computed.
+
+    Args:
+        bands: the raw image, a Dask array (bands, H, W).
+        raster: the description of the image.
+        pipeline: the networks, and how they are run.
+        reading: how the pixels of the image are interpreted.
+
+    Raises:
+        OptionError: an option does not fit the image or the network.
+        ModelError: the networks cannot restore the image.
+        ImageError: the type of the pixels does not tell their full scale.
     """
     da: Any = import_module("dask.array")
     delayed: Any = import_module("dask").delayed
@@ -116,11 +127,11 @@ def _finish(
     """Store the retained pixels (bands, h, w) of one tile.
 
     Args:
-        restorer: the restorer of its band.
-        strip: its raw pixels.
-        around: the results of `_tile` for the tiles within reach, in rows.
-        at: row and column of the first pixel of these.
-        place: the tile.
+        restorer: the restorer of the tile's bands.
+        strip: the raw pixels of the tile.
+        around: the results of `_tile` for the tile and those within reach, row by row.
+        at: the row and column of the image at which `around` begins.
+        place: the group of bands, rows and columns of the tile.
     """
     return restorer.finish(strip, np.block(around), at, place._replace(group=0)).pixels
 

@@ -37,8 +37,12 @@ without it.
 
 
 class RestoredRow(NamedTuple):
-    """A row of tiles: its `span` in the image, the restored `pixels` (bands, rows, width), and
-    their statistics.
+    """A finished row of tiles, or a strip of the traditional pipeline, with all bands.
+
+    Attributes:
+        span: the rows of the raw image that the tiles read and retain.
+        pixels: the restored pixels (bands, rows, width) as they are stored.
+        tally: counts and sums over these pixels and their raw ones.
     """
 
     span: Span
@@ -47,8 +51,13 @@ class RestoredRow(NamedTuple):
 
 
 class NetworkRow(NamedTuple):
-    """A row of tiles as the network returned it: `pixels` (bands, rows, width) float32, NaN where
-    they are missing.
+    """A row of tiles as the network returned it, before the consistency step.
+
+    Attributes:
+        span: the rows of the raw image that the tiles read and retain.
+        strip: the raw rows from which the tiles were restored.
+        pixels: the network's results (bands, rows, width), float32, NaN where pixels are missing.
+        tally: the number of tiles and of runs of the network.
     """
 
     span: Span
@@ -59,9 +68,12 @@ class NetworkRow(NamedTuple):
 
 @dataclass
 class HeldRows:
-    """Rows that the network returned, as far up as the next row of tiles to finish needs them.
+    """A buffer of the network's results for adjacent rows of tiles, until the consistency step has
+    used them. Rows and columns are those of the restored image.
 
-    Rows and columns are those of the restored image.
+    Attributes:
+        top: the first row in the buffer.
+        parts: pixels (bands, rows, width) of adjacent rows of tiles, from the top.
     """
 
     top: int = 0
@@ -69,11 +81,11 @@ class HeldRows:
 
     @property
     def bottom(self) -> int:
-        """The row after the last one."""
+        """The row after the last row in the buffer."""
         return self.top + int(sum(part.shape[1] for part in self.parts))
 
     def window(self, bands: slice, rows: slice, columns: slice) -> np.ndarray:
-        """Return the pixels (bands, h, w) of some rows and columns."""
+        """Return the pixels (bands, h, w) of some bands, rows and columns of the restored image."""
         start = self.top
         pieces = list[np.ndarray]()
         for part in self.parts:
@@ -83,7 +95,7 @@ class HeldRows:
         return np.concatenate(pieces, axis=1)
 
     def forget_above(self, row: int) -> None:
-        """Release the rows above `row`."""
+        """Remove the rows above `row` from the buffer, so that their memory is released."""
         while self.parts and self.top + self.parts[0].shape[1] <= row:
             self.top += self.parts.popleft().shape[1]
         if self.parts and self.top < row:
@@ -99,11 +111,24 @@ def restore_rows(
     tick: Callable[[], None],
     at_once: int = 1,
 ) -> Generator[RestoredRow, None, None]:
-    """Restore rows of tiles in order, `at_once` tiles at a time. `tick` is called once for each
-    tile.
+    """Restore rows of tiles in order, with several tiles in work at a time.
 
-    The network also runs on rows of tiles before the first one, as far as the consistency step
-    reaches.
+    The network also runs on the rows of tiles next to these, as far as the consistency step reads
+    them.
+
+    Args:
+        source: the image.
+        restorer: restores single tiles of the image.
+        rows: adjacent rows of tiles of the restorer's plan, from the top.
+        tick: called once for each tile on which the network has run.
+        at_once: the number of tiles in work at a time, each in a thread.
+
+    Yields:
+        The finished rows of tiles, in the order of `rows`.
+
+    Raises:
+        ImageError: a pixel is no digital number, or the network returns NaN or infinite values.
+        ModelError: the network returns another shape than its file states.
     """
     if not rows:
         return
@@ -134,7 +159,13 @@ def restore_rows(
 
 
 def rows_to_run(restorer: Restorer, rows: Sequence[Span]) -> list[Span]:
-    """Return the rows of tiles that the network must run on to finish `rows`."""
+    """Return the rows of tiles on which the network must run to finish `rows`: these, and those
+    next to them that the consistency step reads.
+
+    Args:
+        restorer: restores single tiles of an image, and knows its plan.
+        rows: adjacent rows of tiles of the plan, from the top.
+    """
     if not rows:
         return []
     start = rows[0].keep_start - restorer.reach_px
@@ -214,15 +245,15 @@ def _gathered(
 def gathered(
     rows: Iterable[RestoredRow], shape: tuple[int, int, int], dtype: np.dtype[Any]
 ) -> tuple[np.ndarray, Tally]:
-    """Gather all restored rows of an image, from the top.
+    """Put the restored rows of an image together in one array.
 
     Args:
-        rows: the rows of tiles or strips, in order.
+        rows: all rows of tiles or strips of the image, from the top.
         shape: the shape of the restored image, (bands, H, W).
         dtype: the dtype of its pixels.
 
     Returns:
-        The pixels, and their statistics.
+        The restored pixels (bands, H, W), and counts and sums over them and their raw pixels.
     """
     pixels = np.empty(shape, dtype)
     tally = Tally()
@@ -242,10 +273,24 @@ def restore_floats(
     max_dn: float = MAX_DN,
     consistency: Steps = (),
 ) -> np.ndarray:
-    """Restore (H, W) digital numbers of 0 to `max_dn` to float32, not rounded, as `restore` writes
-    floats.
+    """Restore an image of one band in memory, to floats that are not rounded.
 
-    NaN is a missing pixel, and stays NaN.
+    The pixels are those that `restore` writes for an image of floats.
+
+    Args:
+        dn: digital numbers (H, W) of 0 to `max_dn`. NaN is a missing pixel, and stays NaN.
+        network: the network ready to run, with versions for higher exposures or without.
+        plan: how the image is cut into tiles.
+        max_dn: the largest digital number, which is 1.0 to the network; by default that of 12 bits.
+        consistency: the step that makes the result agree with the raw image at low spatial
+            frequencies, as a tuple of one; empty to omit it.
+
+    Returns:
+        Restored digital numbers (H, W), float32.
+
+    Raises:
+        ModelError: the network returns another number of bands or another size than the image's.
+        ImageError: a value is below 0 or above `max_dn`.
     """
     if plan.out_shape != (1, *dn.shape):
         raise ModelError(
@@ -269,7 +314,23 @@ def restore_dn(
     max_dn: float = MAX_DN,
     consistency: Steps = (),
 ) -> np.ndarray:
-    """Restore (H, W) digital numbers of 0 to `max_dn` to integers in float32, as `restore` writes
-    integers.
+    """Restore an image of one band in memory, to integers in float32.
+
+    The pixels are those that `restore` writes for an image of integers.
+
+    Args:
+        dn: digital numbers (H, W) of 0 to `max_dn`. NaN is a missing pixel, and stays NaN.
+        network: the network ready to run, with versions for higher exposures or without.
+        plan: how the image is cut into tiles.
+        max_dn: the largest digital number, which is 1.0 to the network; by default that of 12 bits.
+        consistency: the step that makes the result agree with the raw image at low spatial
+            frequencies, as a tuple of one; empty to omit it.
+
+    Returns:
+        Restored digital numbers (H, W), whole numbers in float32.
+
+    Raises:
+        ModelError: the network returns another number of bands or another size than the image's.
+        ImageError: a value is below 0 or above `max_dn`.
     """
     return np.asarray(np.rint(restore_floats(dn, network, plan, max_dn, consistency)))

@@ -46,16 +46,18 @@ __all__ = [
 def measure(
     images: Sequence[Path], edges: Sequence[str] = (), stated: Stated | None = None
 ) -> Measurement:
-    """Measure noise, MTF and SNR of a sensor from its raw frames.
+    """Measure noise, MTF and SNR of a sensor from its raw images.
 
     Args:
         images: raw images of one sensor at one setting: files, and folders of them.
-        edges: boxes with one straight edge as FILE:X,Y,WIDTH,HEIGHT. If empty, edges are searched
-            for in the images.
-        stated: the values that the user states. A stated MTF is not measured.
+        edges: boxes with one straight edge as FILE:X,Y,WIDTH,HEIGHT in pixels. If empty, edges are
+            searched for in the images.
+        stated: the values that the user states about the sensor; None states none. A stated MTF is
+            not measured.
 
     Returns:
-        The frames, the line of noise, the MTF curves and the SNRs, with the gain stated or assumed.
+        The images as frames, the noise as a function of the signal, the MTF curves, the SNRs at two
+        radiances, and the gain, which the user states or which is assumed.
 
     Raises:
         ImageError: there is no image, or the images are not frames of one sensor.
@@ -73,10 +75,10 @@ def measure(
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredSensor(Sensor):
-    """A sensor measured on its own images.
+    """The profile of a sensor that was measured on its own images, as `characterize` returns it.
 
     Attributes:
-        table: the figures with their intervals.
+        table: the measured figures with their intervals, and notes for the user.
     """
 
     table: Table | None = None
@@ -85,12 +87,20 @@ class MeasuredSensor(Sensor):
 def measured_sensor(
     images: Any, edges: Sequence[str], stated: Stated
 ) -> tuple[MeasuredSensor, str]:
-    """Measure a sensor, and return it with the text of its profile.
+    """Measure a sensor from its raw images, and build its profile.
 
     Args:
-        images: one or several, each a path or an array (H, W) of integers.
-        edges: boxes with one straight edge as FILE:X,Y,WIDTH,HEIGHT.
-        stated: the values that the user states.
+        images: one image or a list of them, each a path or an array (H, W) of integers.
+        edges: boxes with one straight edge as FILE:X,Y,WIDTH,HEIGHT in pixels; if empty, edges are
+            searched for.
+        stated: the values that the user states about the sensor.
+
+    Returns:
+        The sensor, and its profile as the text of a TOML file.
+
+    Raises:
+        ImageError: an image is no array of integers, or the images are not of one sensor.
+        OptionError: a box or a stated value does not fit the images.
     """
     several = images if isinstance(images, list | tuple) else [images]
     with TemporaryDirectory(prefix="beers-deploy-") as folder:

@@ -32,14 +32,15 @@ probable.
 
 @dataclass(frozen=True)
 class Frames:
-    """Raw frames of one camera at one setting.
+    """Raw images of one camera at one setting, and what their values mean.
 
     Attributes:
-        paths: the paths of the images, sorted as given.
-        step: the stored step of one digital number, of which all stored values are multiples.
-        bits: the bits of a digital number.
-        bits_stated: True if the user states them.
-        black_dn: the digital number of the dark, subtracted from all that is measured.
+        paths: the paths of the images, in the given order; those of a folder are sorted by name.
+        step: the stored value of one digital number; all stored values are multiples of it.
+        bits: the number of bits of a digital number.
+        bits_stated: True if the user states the bits; False if clipped pixels show them.
+        black_dn: the digital number that the camera stores without light, as the user states it; 0
+            if the user does not. Measurements subtract it, `read` does not.
         darkest_dn: the digital number of the darkest pixels, the black level included.
     """
 
@@ -52,23 +53,25 @@ class Frames:
 
     @property
     def full_scale_dn(self) -> int:
-        """The largest digital number."""
+        """The largest digital number, at which pixels clip."""
         return int(2**self.bits) - 1
 
     @property
     def stored_full_scale(self) -> int:
-        """The value of full scale in the files."""
+        """The value that the files store for the largest digital number."""
         return self.full_scale_dn * self.step
 
     @property
     def name(self) -> str:
-        """A short description of the frames."""
+        """The name of the first image and the number of others, for messages."""
         more = f" and {len(self.paths) - 1} more" if len(self.paths) > 1 else ""
         return f"{self.paths[0].name}{more}"
 
     @property
     def hides_black(self) -> bool:
-        """True if no black level is stated, although no pixel in the frames is near 0."""
+        """True if the user states no black level although no pixel is near 0, so that the camera
+        probably has one.
+        """
         return not self.black_dn and self.darkest_dn > DARK_SHARE * self.full_scale_dn
 
     def read(self, path: Path) -> np.ndarray:
@@ -76,7 +79,9 @@ class Frames:
         return read_raw(path).astype(np.float64) / self.step
 
     def tiles(self, path: Path) -> Iterator[np.ndarray]:
-        """Yield the frame in parts (h, w) of at most 1024 pixels a side."""
+        """Yield the digital numbers of one frame in parts (h, w) of at most `TILE_PX` pixels a
+        side.
+        """
         pixels = self.read(path)
         for top in range(0, pixels.shape[0], TILE_PX):
             for left in range(0, pixels.shape[1], TILE_PX):
@@ -84,13 +89,18 @@ class Frames:
 
 
 def open_frames(images: Sequence[Path], bits: int | None, black_level: float | None) -> Frames:
-    """Determine the step, the bits and the dark of raw frames.
+    """Read raw images of one camera, and determine the step, the bits and the black level.
 
     Args:
         images: files, and folders whose images are sorted by name.
-        bits: the bits of a digital number, or of a stored value; None to infer them from clipped
-            pixels.
-        black_level: the stored value of the dark; None uses 0.
+        bits: the number of bits of a digital number, or of a stored value; None infers it from
+            clipped pixels.
+        black_level: the stored value of a pixel without light; None uses 0.
+
+    Raises:
+        ImageError: there is no image, or an image has no whole digital numbers in steps of 1.
+        OptionError: an image is given twice, the bits cannot be inferred or do not fit the pixels,
+            or the black level is not below the median of the images.
     """
     paths: tuple[Path, ...] = ()
     for image in images:
@@ -122,11 +132,11 @@ class _Look:
     """Statistics of the stored values of one frame.
 
     Attributes:
-        step: largest number that divides all values.
+        step: the largest integer that divides all values.
         largest: the largest value.
-        piled: True if pixels accumulate there, as they do only at full scale.
-        darkest: value of the darkest pixels.
-        middle: median.
+        piled: True if pixels accumulate at the largest value, as they do only at full scale.
+        darkest: the value of the darkest pixels.
+        middle: the median of the values.
     """
 
     step: int
@@ -183,8 +193,15 @@ def _settled_bits(stated: int | None, largest: int, step: int, piled: bool) -> i
 
 
 def read_raw(path: Path) -> np.ndarray:
-    """Read the stored values (H, W) of one band, integers of any width, with 0 where they are
-    missing.
+    """Read the stored values of a raw image of one band.
+
+    Returns:
+        The values (H, W), integers of the type that the file has or floats without fractions, with
+        0 where pixels are missing.
+
+    Raises:
+        ImageError: the image has several bands, or values that are no whole numbers of 0 to
+            `MAX_DN`.
     """
     with open_raster(path) as source:
         raster = source.raster
@@ -211,8 +228,19 @@ def read_raw(path: Path) -> np.ndarray:
 
 
 def cut_box(words: str, frames: Frames) -> np.ndarray:
-    """Return the digital numbers (h, w) in the box FILE:X,Y,WIDTH,HEIGHT, where FILE is one of the
-    frames.
+    """Read the digital numbers in a box with an edge that the user points at.
+
+    Args:
+        words: the box as FILE:X,Y,WIDTH,HEIGHT in pixels, where FILE is one of the frames and X,Y
+            the upper left pixel, counted from 0.
+        frames: the raw images.
+
+    Returns:
+        The digital numbers (HEIGHT, WIDTH), float64.
+
+    Raises:
+        OptionError: the text has another form, names another file, or the box is too small or
+            reaches beyond the image.
     """
     parts = re.fullmatch(r"(.*):(\d{1,8}),(\d{1,8}),(\d{1,8}),(\d{1,8})", words, re.ASCII)
     if parts is None:

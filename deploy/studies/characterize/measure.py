@@ -40,12 +40,13 @@ Variance = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Noise:
-    """The noise of frames, above the dark.
+    """The noise of a camera, as measured in its raw images.
 
     Attributes:
-        model: the fitted line.
-        pairs: the number of pairs of frames of one still scene that it rests on; 0 if it rests on
-            single frames.
+        model: the variance of the noise as a straight line over the digital number above the black
+            level.
+        pairs: the number of pairs of images of one still scene whose differences the line was
+            fitted to; 0 if it was fitted to single images.
     """
 
     model: NoiseModel
@@ -53,7 +54,15 @@ class Noise:
 
 
 def measure_noise(frames: Frames) -> Noise:
-    """Fit the noise line to all frames, or to the differences of frames of one still scene."""
+    """Measure the noise of a camera in its raw images.
+
+    If some images show the same scene pixel by pixel, their differences are used, because these
+    contain no texture; otherwise the even ground in all images.
+
+    Raises:
+        ImageError: the noise cannot be measured, or the images differ in noise, so that they are
+            not of one sensor at one setting.
+    """
     frame_blocks = [
         image_blocks(frames.tiles(path), frames.full_scale_dn, frames.black_dn)
         for path in frames.paths
@@ -73,8 +82,8 @@ def measure_noise(frames: Frames) -> Noise:
 
 
 def _still_pairs(frames: Frames) -> list[Blocks]:
-    """Return blocks of the differences of frames that show the same scene, pixel by pixel (photon
-    transfer).
+    """Return the blocks of the difference of each two frames that show the same scene, pixel by
+    pixel (photon transfer).
     """
     # Two frames of a still scene have one level: sorted by it, they are neighbours.
     by_level = sorted(frames.paths, key=lambda path: float(np.median(frames.read(path))))
@@ -125,13 +134,20 @@ def _require_one_sensor(frames: Frames, frame_blocks: Sequence[Blocks], dn: floa
 def measure_mtf(
     frames: Frames, boxes: Mapping[str, np.ndarray], noise: NoiseModel
 ) -> dict[str, MtfCurve | Refusal]:
-    """Measure the MTF across (edges near the vertical) and along the track.
+    """Measure the MTF of a camera across and along the track, from straight edges in its images.
 
     Args:
-        frames: the frames of the camera.
-        boxes: pixels (h, w) with one edge each, by their description; if empty, all frames are
-            searched.
-        noise: the noise of the pixels, above the dark.
+        frames: the raw images of the camera.
+        boxes: digital numbers (h, w) with one edge each, by the text of the box; if empty, edges
+            are searched in all images.
+        noise: the noise as a function of the digital number above the black level.
+
+    Returns:
+        By the axis, "across" (from edges near the vertical) and "along", the measured curve, or the
+        reason why there is none.
+
+    Raises:
+        ImageError: a box has no straight edge from side to side.
     """
 
     def variance(dn: np.ndarray) -> np.ndarray:
@@ -184,8 +200,13 @@ def _rise(region: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class Snr:
-    """The SNR at one radiance, in W/m2/sr/um, with its 95 % interval, whose limits may be
-    infinite.
+    """The SNR of a camera at one radiance.
+
+    Attributes:
+        radiance: the radiance in W/m2/sr/um.
+        value: the SNR as a ratio; infinite without noise.
+        interval: the lower and upper end of its 95 % interval, which may be infinite.
+        extrapolated: True if no pixels of this radiance were measured.
     """
 
     radiance: float
@@ -195,6 +216,12 @@ class Snr:
 
 
 def snr_at(noise: NoiseModel, dn: float, gain: float) -> Snr:
-    """Return the SNR at a digital number above the dark, without the rounding."""
+    """Compute the SNR of a camera at one level of light, without the noise of rounding.
+
+    Args:
+        noise: the noise as a function of the digital number above the black level.
+        dn: the digital number above the black level.
+        gain: the digital numbers per W/m2/sr/um.
+    """
     variance = noise.at(dn)
     return Snr(dn / gain, *snr(dn, variance), variance.extrapolated)

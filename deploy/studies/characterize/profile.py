@@ -41,11 +41,11 @@ class Stated:
     """The values that the user states about a camera; None if a value is measured or assumed.
 
     Attributes:
-        bits: the bits of a digital number.
-        gain: DN per W/m2/sr/um.
-        gsd_m: ground sampling distance.
-        black_level: value of the dark in the files.
-        mtf: contrast at Nyquist across and along the track, instead of a measurement.
+        bits: the number of bits of a digital number.
+        gain: the digital numbers per W/m2/sr/um, above 0.
+        gsd_m: the ground sampling distance in metres, above 0.
+        black_level: the value that the files store for a pixel without light.
+        mtf: the MTF at Nyquist across and along the track as shares, which is then not measured.
     """
 
     bits: int | None = None
@@ -64,16 +64,16 @@ class Stated:
 
 @dataclass(frozen=True)
 class Measurement:
-    """The measurement of a camera.
+    """The result of measuring a camera on its raw images.
 
     Attributes:
-        frames: the frames that were measured.
-        noise: the line that the SNRs lie on.
-        mtf: for each axis the measured curve, or the reason why there is none; empty if the user
-            states the MTF.
-        snrs: at two radiances.
-        gain: DN per W/m2/sr/um, stated or assumed.
-        stated: by the user.
+        frames: the images that were measured.
+        noise: the noise as a function of the signal, from which the SNRs follow.
+        mtf: by the axis ("across" and "along" the track) the measured curve, or the reason why
+            there is none; empty if the user states the MTF.
+        snrs: the SNRs at the two radiances that a profile states.
+        gain: the digital numbers per W/m2/sr/um, stated by the user or assumed.
+        stated: the values that the user states.
     """
 
     frames: Frames
@@ -85,11 +85,13 @@ class Measurement:
 
     @property
     def curves(self) -> dict[str, MtfCurve]:
-        """The measured curve of each axis that has one."""
+        """The measured MTF curves by the axis, without axes that have none."""
         return {axis: curve for axis, curve in self.mtf.items() if isinstance(curve, MtfCurve)}
 
     def rows(self) -> list[Row]:
-        """Return the figures, as commands report them."""
+        """Return the row of results with MTF, SNR and the spectrum of the noise, as `characterize`
+        reports them.
+        """
         figures: dict[str, Figure] = {}
         for axis in AXES:
             curve = self.mtf.get(axis, Refusal("the user states it"))
@@ -176,8 +178,10 @@ def _blocks(noise: Noise) -> str:
 
 
 def profile_toml(measurement: Measurement) -> str:
-    """Return the profile as TOML. The source of each measured value includes its interval, and any
-    doubt.
+    """Write the measurement of a camera as a sensor profile, and return the text of the TOML file.
+
+    Each value states whether it is measured, stated by the user or assumed. The source of a
+    measured one includes its interval and any doubt.
     """
     frames = measurement.frames
     images = printable(frames.name)
@@ -216,8 +220,8 @@ def profile_toml(measurement: Measurement) -> str:
 
 
 def _mtf_table(sensor: Measurement, images: str) -> dict[str, object]:
-    """Return the measured curves, the user's values, or an assumption. An axis without a curve uses
-    the other's.
+    """Return the table `mtf` of a profile: measured curves, the user's values, or an assumption. An
+    axis without a curve has the curve of the other axis.
     """
     if sensor.stated.mtf is not None:
         across, along = (
@@ -250,8 +254,8 @@ def _edges(curve: MtfCurve) -> str:
 
 
 def _noise_table(sensor: Measurement, images: str) -> dict[str, object]:
-    """Return the SNRs as linear ratios without the rounding to integer DN. The darker one is
-    limited to the bounds of physics.
+    """Return the table `noise` of a profile: the SNRs as ratios, without the rounding to integer
+    DN. The one at the darker radiance is limited to what physics allows.
     """
     model = sensor.noise.model
     dark, bright = (dn / sensor.gain for dn in model.measured_dn)

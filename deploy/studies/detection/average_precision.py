@@ -47,16 +47,18 @@ if there is no object.
 
 @dataclass(frozen=True)
 class Hits:
-    """Every detection on a set of images, sorted by descending score, and which of them found an
-    object.
+    """The D detections of one detector on I images, and which of them found an object.
+
+    Results depend on the range of object sizes (S ranges, `SIZES_PX`) and on the overlap that is
+    required (`OVERLAPS`, 10 of them).
 
     Attributes:
-        images: (D,) int64, the image of each detection.
-        classes: (D,) int64.
-        scores: (D,) float64, descending.
-        hits: (S, 10, D) bool, True if it found an object, by `SIZES_PX` and `OVERLAPS`.
-        ignored: (S, 10, D) bool, True if it counts neither as hit nor as false.
-        objects: (S, C, I) int64, the number of objects to find, by size, class and image.
+        images: the index of the image of each detection, (D,) int64.
+        classes: the index of the class of each detection, (D,) int64.
+        scores: the confidence of each detection, (D,) float64, in descending order.
+        hits: True if the detection found an object, (S, 10, D) bool.
+        ignored: True if the detection counts neither as a hit nor as false, (S, 10, D) bool.
+        objects: the number of objects to find, by size, class and image, (S, C, I) int64.
     """
 
     images: np.ndarray
@@ -77,9 +79,9 @@ def find_hits(truths: Sequence[Boxes], detected: Sequence[Boxes], classes: int) 
     objects than photographs do.
 
     Args:
-        truths: labelled boxes of each image. Images without any are included: detections there
-            are false.
-        detected: the detections on each image, in the same px, of the same classes.
+        truths: the labelled boxes of each image. Images without an object are included, because
+            detections there are false.
+        detected: the detections on each image, in the pixels and classes of its labelled boxes.
         classes: the number of classes.
     """
     scores = np.concatenate([boxes.scores for boxes in detected])
@@ -107,11 +109,15 @@ def _of_other_size(boxes: Boxes) -> np.ndarray:
 
 
 def match(truth: Boxes, detected: Boxes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Match the N boxes found on an image with its M labelled ones, by `SIZES_PX` and `OVERLAPS`.
+    """Match the detections on one image with its labelled objects, as `find_hits` describes.
+
+    Args:
+        truth: the M labelled boxes of the image.
+        detected: the N detections on the image.
 
     Returns:
-        Masks of the boxes found that are hits, and of those that are ignored, (S, 10, N), and of
-        the objects that are matched, (S, 10, M).
+        Three masks for each of S size ranges and 10 overlaps: of the detections that are hits, of
+        those that are ignored, both (S, 10, N), and of the objects that were found, (S, 10, M).
     """
     uncounted = np.repeat((truth.ignored | _of_other_size(truth))[:, None], len(OVERLAPS), axis=1)
     ignored = np.repeat(_of_other_size(detected)[:, None], len(OVERLAPS), axis=1)
@@ -136,8 +142,16 @@ def match(truth: Boxes, detected: Boxes) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def site_weights(sites: Sequence[str], seed: int, draws: int = DRAWS) -> np.ndarray:
-    """Return the weights of the images, (1 + draws, I): 1 for all, then the number of times that
-    each draw with replacement contains their site.
+    """Draw the weights of images for a bootstrap over sites, which gives the intervals of figures.
+
+    Args:
+        sites: the site of each of I images; images of one site resemble one another.
+        seed: the seed of the draws.
+        draws: the number of draws with replacement of as many sites as there are.
+
+    Returns:
+        The weights, (1 + draws, I) integers: a row of ones for the figure itself, then for each
+        draw the number of times that it contains the site of the image.
     """
     names, site = np.unique(np.array(sites), return_inverse=True)
     generator = np.random.default_rng(seed)
@@ -147,10 +161,15 @@ def site_weights(sites: Sequence[str], seed: int, draws: int = DRAWS) -> np.ndar
 
 
 def interval(values: np.ndarray, sites: int) -> tuple[float, float] | None:
-    """Return the 95 % interval of a figure, or of a difference of two, (1 + draws,), from the
-    percentiles of its draws.
+    """Return the 95 % interval of a figure, or of a difference of two figures, from its bootstrap.
 
-    With fewer than `LEAST_SITES` different sites it is None, because it could not be trusted.
+    Args:
+        values: the figure on all images, then on each draw of the bootstrap, (1 + draws,).
+        sites: the number of different sites.
+
+    Returns:
+        The percentiles of the draws; None if the figure is NaN, or if there are fewer than
+        `LEAST_SITES` sites, because the interval could not be trusted.
     """
     defined = values[1:][~np.isnan(values[1:])]
     if np.isnan(values[0]) or sites < LEAST_SITES or not len(defined):
@@ -159,8 +178,8 @@ def interval(values: np.ndarray, sites: int) -> tuple[float, float] | None:
 
 
 def sites_note(sites: int) -> str:
-    """Return a sentence on the reliability of intervals over this number of sites, or "" if they
-    are reliable.
+    """Return a sentence for the reader of the results if bootstrap intervals over `sites` different
+    sites are missing or too narrow to be trusted; else an empty text.
     """
     few = (
         f"Only {sites} sites: the intervals are too narrow to be trusted."
@@ -173,14 +192,18 @@ def sites_note(sites: int) -> str:
 def score_rows(
     rows: Mapping[str, Hits], names: Sequence[str], weights: np.ndarray
 ) -> tuple[dict[str, Figures], float]:
-    """Return every figure of every row, and the confidence at which `precision` and `recall` are
-    sampled in all of them.
+    """Compute all figures of several rows of a study, which show the same scenes in different ways.
+
+    Precision and recall of all rows are sampled at one confidence, that of the best F1 of the first
+    row on all images.
 
     Args:
-        rows: rows of the same images. The confidence is that of the best F1 of the first row on all
-            images.
+        rows: the matched detections of each row, by the name of the row.
         names: the names of the classes.
-        weights: (W, I), the weight of each image, as `site_weights` returns it.
+        weights: the weights of the images, (W, I), as `site_weights` returns them.
+
+    Returns:
+        The figures of each row, as `score` returns them, and the confidence.
     """
     confidence = float(score(next(iter(rows.values())), names, weights[:1])["own confidence"][0])
     return {row: score(hits, names, weights, confidence) for row, hits in rows.items()}, confidence
@@ -189,14 +212,18 @@ def score_rows(
 def score(
     hits: Hits, names: Sequence[str], weights: np.ndarray, confidence: float = 0.0
 ) -> Figures:
-    """Return every figure of a row, (W,) each.
+    """Compute all figures of one row of a study: average precisions, precision and recall.
 
     Args:
-        hits: the hits of the row.
+        hits: the matched detections of the row.
         names: the names of the classes.
-        weights: (W, I) integers, the weight of each image.
-        confidence: where `precision` and `recall` are sampled. `own precision` and `own recall` are
-            sampled at `own confidence`, that of the row's best F1.
+        weights: the weights of the images, (W, I) integers, as `site_weights` returns them.
+        confidence: the confidence at which `precision` and `recall` are sampled. `own precision`
+            and `own recall` are sampled at `own confidence`, that of the row's best F1.
+
+    Returns:
+        The figures by name, shares of 0 to 1, (W,) each: for each set of weights one value, NaN if
+        there is no object.
     """
     every = len(OVERLAPS)
     by_class = np.array(
@@ -228,8 +255,15 @@ def score(
 
 
 def map50(hits: Hits, weights: np.ndarray, size: int = ALL) -> np.ndarray:
-    """Return the average precision at an overlap of one half, mean over classes, (W,). The
-    arguments are those of `score`.
+    """Compute mAP50, the average precision at an overlap of one half, mean over classes.
+
+    Args:
+        hits: the matched detections.
+        weights: the weights of the images, (W, I), as `site_weights` returns them.
+        size: the index of the range of object sizes in `SIZES_PX`; by default all sizes.
+
+    Returns:
+        The share of 0 to 1 for each set of weights, (W,); NaN if there is no object.
     """
     kinds = range(hits.objects.shape[1])
     return mean_known(
@@ -247,18 +281,18 @@ def mean_known(values: np.ndarray) -> np.ndarray:
 def precisions(
     hits: Hits, kind: int, weights: np.ndarray, size: int = ALL, levels: int = 1
 ) -> np.ndarray:
-    """Return the precision of a class at each of `RECALLS`, (W, levels, 101): the best at that
-    recall or more (COCO).
+    """Compute the precision of one class at each of `RECALLS`: the best precision at this recall or
+    a higher one, as COCO defines it.
 
     Args:
-        hits: the hits of a row.
-        kind: number of the class.
-        weights: (W, I) the weight of each image.
-        size: number of a range of `SIZES_PX`.
-        levels: the number of `OVERLAPS` to use, from the first.
+        hits: the matched detections.
+        kind: the index of the class.
+        weights: the weights of the images, (W, I), as `site_weights` returns them.
+        size: the index of the range of object sizes in `SIZES_PX`; by default all sizes.
+        levels: the number of `OVERLAPS` to use, from the first; by default only one half.
 
     Returns:
-        NaN where the class has no object.
+        The precisions of 0 to 1, (W, levels, 101); NaN if the class has no object.
     """
     totals = weights @ hits.objects[size, kind]
     curves = np.full((len(weights), levels, len(RECALLS)), np.nan)

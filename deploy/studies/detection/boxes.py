@@ -29,13 +29,15 @@ compared, best scores first.
 
 @dataclass(frozen=True)
 class Boxes:
-    """Boxes of one image.
+    """The N labelled or detected boxes of one image.
 
     Attributes:
-        corners: (N, 4) float64: left, top, right and bottom in px.
-        classes: (N,) int64, indices of a tuple of names that is stored elsewhere.
-        scores: (N,) float64 confidence in 0 to 1; 1 for labelled boxes.
-        ignored: (N,) bool: detections inside such a box count neither for nor against a detector.
+        corners: left, top, right and bottom of each box in pixels, (N, 4) float64.
+        classes: the class of each box, (N,) int64, as an index of a tuple of names that is stored
+            elsewhere.
+        scores: the confidence of each detection in 0 to 1, (N,) float64; 1 for labelled boxes.
+        ignored: True for a labelled box that need not be found, (N,) bool: detections inside it
+            count neither for nor against a detector.
     """
 
     corners: np.ndarray
@@ -51,8 +53,13 @@ class Boxes:
         scores: ArrayLike | None = None,
         ignored: ArrayLike | None = None,
     ) -> "Boxes":
-        """Create boxes from any array-like. Without scores they are labelled ones, and none is
-        ignored by default.
+        """Create boxes from lists or arrays.
+
+        Args:
+            corners: left, top, right and bottom of each box in pixels, (N, 4).
+            classes: the index of the class of each box, (N,).
+            scores: the confidence of each detection in 0 to 1, (N,); None for labelled boxes.
+            ignored: True for a box that need not be found, (N,); None ignores no box.
         """
         array = np.asarray(corners, np.float64).reshape(-1, 4)
         count = len(array)
@@ -73,15 +80,19 @@ class Boxes:
         )
 
     def renamed(self, classes: np.ndarray) -> "Boxes":
-        """Return the boxes with class c replaced by `classes[c]`, without boxes of a class that
-        becomes -1.
+        """Return the boxes with other class indices, such as those of a detector.
+
+        Args:
+            classes: the new index of each old one, (C,); boxes of a class with -1 are removed.
         """
         new = np.asarray(classes, np.int64)[self.classes]
         return Boxes(self.corners, new, self.scores, self.ignored)[new >= 0]
 
     def clipped(self, height_px: float, width_px: float) -> "Boxes":
-        """Return the parts inside an image. Boxes completely outside are left out, and those mostly
-        outside are ignored.
+        """Return the boxes cut at the borders of an image of `height_px` x `width_px` pixels.
+
+        A box completely outside is removed. A box of which less than `MIN_VISIBLE` is inside is
+        marked as ignored.
         """
         limits = np.array([width_px, height_px, width_px, height_px])
         inside = np.clip(self.corners, 0, limits)
@@ -92,20 +103,23 @@ class Boxes:
 
 
 def areas(corners: np.ndarray) -> np.ndarray:
-    """Return the areas in px2 (N,) of corners (N, 4), or 0 if a right or lower edge lies before its
-    opposite.
+    """Return the areas of boxes in square pixels, (N,), given their corners (N, 4). The area is 0
+    if the right or lower edge lies before the opposite one.
     """
     return np.asarray(np.prod(np.maximum(corners[:, 2:] - corners[:, :2], 0), axis=1))
 
 
 def iou(one: np.ndarray, other: np.ndarray, ignored: np.ndarray | bool = False) -> np.ndarray:
-    """Return the intersection over union (N, M), 0 to 1, of corners (N, 4) and (M, 4). It is 0 for
-    two boxes without area.
+    """Compute the overlap of each box with each other box: their intersection over union.
 
     Args:
-        one: corners.
-        other: corners.
-        ignored: (M,) True where the overlap is the share of `one` inside `other`.
+        one: the corners of N boxes, (N, 4).
+        other: the corners of M boxes, (M, 4).
+        ignored: True for boxes of `other` that need not be found, (M,). For these the overlap is
+            the share of the box of `one` that lies inside, as COCO has it for crowds.
+
+    Returns:
+        The overlaps of 0 to 1, (N, M); 0 for two boxes without area.
     """
     low = np.maximum(one[:, None, :2], other[None, :, :2])
     high = np.minimum(one[:, None, 2:], other[None, :, 2:])
@@ -142,15 +156,18 @@ def suppress(boxes: Boxes) -> Boxes:
 
 
 class Letterbox:
-    """Fits an image of any size into a detector's square input: scaled uniformly, centred, padded
-    grey.
+    """Fits images of one size into a detector's square input: scaled uniformly, centred, padded
+    grey; and converts boxes back.
 
     Downscaling samples bilinearly without a prefilter, as Ultralytics does when it trains and runs.
 
     Args:
         height_px: the height of the image.
         width_px: the width of the image.
-        size_px: side of the input.
+        size_px: the side of the detector's input in pixels.
+
+    Raises:
+        OptionError: the image is so narrow that less than a pixel of its short side would be left.
     """
 
     def __init__(self, height_px: int, width_px: int, size_px: int) -> None:
@@ -172,8 +189,13 @@ class Letterbox:
         self._shift = np.tile([left, top], 2)
 
     def image(self, rgb: np.ndarray) -> np.ndarray:
-        """Return the input, (3, size_px, size_px) float32, for an image (height_px, width_px, 3) in
-        0 to 1.
+        """Convert an image to the detector's input.
+
+        Args:
+            rgb: the image (height_px, width_px, 3) in 0 to 1.
+
+        Returns:
+            The input (3, size_px, size_px), float32 in 0 to 1.
         """
         # Shrunk without a filter in front, as Ultralytics does when it trains and runs.
         same = self._inner == rgb.shape[:2]
@@ -184,5 +206,7 @@ class Letterbox:
         return np.ascontiguousarray(padded.transpose(2, 0, 1))
 
     def to_image(self, corners: np.ndarray) -> np.ndarray:
-        """Convert (N, 4) corners from px of the input to px of the image."""
+        """Convert the corners of boxes, (N, 4), from pixels of the detector's input to pixels of
+        the image.
+        """
         return np.asarray((corners - self._shift) / self._gain)

@@ -51,12 +51,13 @@ REMEDY = "Export it with Ultralytics for detection, with format='onnx'."
 
 @dataclass(frozen=True)
 class Detector:
-    """A detector ready to run.
+    """An object detector, ready to run.
 
     Attributes:
-        names: the names of its classes, in its order.
-        size_px: side of its square input.
-        flag: a sentence on why its average precision is too low; empty if nothing is dropped.
+        names: the names of the classes, in the order of the class indices of its boxes.
+        size_px: the side of its square input in pixels.
+        flag: a warning for the reader of results if the file itself drops boxes of low confidence,
+            so that its average precision is too low; else empty.
     """
 
     names: tuple[str, ...]
@@ -65,11 +66,16 @@ class Detector:
     _run: Callable[[np.ndarray], np.ndarray]
 
     def detect(self, rgb: np.ndarray) -> Boxes:
-        """Detect objects on an image (H, W, 3) float32 in 0 to 1. Return at most 300 boxes, best
-        score first.
+        """Detect objects on an image.
+
+        Args:
+            rgb: the image (H, W, 3), float32 in 0 to 1.
 
         Returns:
-            Boxes in px of the image, cut at its borders.
+            At most 300 boxes in pixels of the image, cut at its borders, best score first.
+
+        Raises:
+            ModelError: the detector does not run, or returns no valid boxes and scores.
         """
         height, width = rgb.shape[:2]
         box = Letterbox(height, width, self.size_px)
@@ -79,8 +85,17 @@ class Detector:
         return Boxes.of(inside.corners, inside.classes, inside.scores)
 
     def decoded(self, output: np.ndarray) -> Boxes:
-        """Decode an output (1, 4 + classes, anchors) raw, or (1, N, 6) final, to boxes in px of the
-        input, suppressed.
+        """Convert an output of the network to boxes.
+
+        Args:
+            output: either (1, 4 + classes, anchors), centres, sizes and class scores, of which
+                several may lie on one object; or (1, N, 6), corners, score and class.
+
+        Returns:
+            The boxes in pixels of the detector's input, one on each object, best score first.
+
+        Raises:
+            ModelError: the output has another shape, NaN, scores outside 0 to 1 or unknown classes.
         """
         if not _is_read(output.shape, len(self.names)):
             sizes = " x ".join(map(str, output.shape))
@@ -102,12 +117,17 @@ class Detector:
 
 
 def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> Detector:
-    """Open a detector's file.
+    """Open the file of an object detector.
 
     Args:
-        path: an ONNX file.
-        threads: the threads of onnxruntime; 0 uses one thread for each core.
-        size_px: side of the input; None uses the size that the file is fixed to or was trained for.
+        path: an ONNX file that Ultralytics exported for detection.
+        threads: the number of threads of onnxruntime; 0 uses one for each core.
+        size_px: the side of the square input in pixels; None uses the size that the file is fixed
+            to or was trained for.
+
+    Raises:
+        ModelError: the file cannot be opened, has another layout, or does not state its classes.
+        OptionError: `size_px` contradicts the file, or is missing and the file states no size.
     """
     model = load_onnx(path)
     # Ultralytics writes its metadata as Python literals.
@@ -235,17 +255,21 @@ def _final(output: np.ndarray, classes: int) -> Boxes:
 
 
 def letters(name: str) -> str:
-    """Return the letters and digits of a class name, without case, because tools spell the same
-    names differently.
+    """Return the letters and digits of a class name in lower case, for the comparison of names that
+    tools spell differently, such as "Small-Car" and "small car".
     """
     return "".join(c for c in name.casefold() if c.isalnum())
 
 
 def class_names(names: Any) -> tuple[str, ...]:
-    """Return the class names that a file states, or () if they are not valid.
+    """Return the class names that a detector's file states, in the order of their indices.
 
     Args:
-        names: a list of names, or a table of names by number from 0. Any other value is not valid.
+        names: the value in the file's metadata: a list of names, or a dict of names by number from
+            0. Any other value is not valid.
+
+    Returns:
+        The names; an empty tuple if the value is not valid.
     """
     names = (
         [names.get(number) for number in range(len(names))] if isinstance(names, dict) else names
@@ -258,7 +282,13 @@ def class_names(names: Any) -> tuple[str, ...]:
 
 
 def parse_classes(text: str) -> dict[str, str]:
-    """Parse LABELLED=DETECTOR,... into the detector's class by labelled class.
+    """Parse the option that maps labelled classes to classes of the detector.
+
+    Args:
+        text: pairs of names, LABELLED=DETECTOR,LABELLED=DETECTOR.
+
+    Returns:
+        The detector's name by the labelled name.
 
     Raises:
         OptionError: the text has another form, or names a labelled class twice.
@@ -282,13 +312,13 @@ def class_numbers(
     name; case, spaces and punctuation are ignored.
 
     Args:
-        labelled: names in the order of the labels' numbers.
-        detector: names in the order of the detector's.
-        mapping: the detector's name by labelled name, as `parse_classes` returns it.
+        labelled: the L names of the labelled classes, in the order of their indices.
+        detector: the names of the detector's classes, in the order of their indices.
+        mapping: the detector's name by the labelled name, as `parse_classes` returns it.
 
     Returns:
-        (L,) int64 indices, -1 for a class that the detector does not know, as `Boxes.renamed`
-        accepts it.
+        The index of the detector's class for each labelled class, (L,) int64; -1 for a class that
+        the detector does not know. `Boxes.renamed` accepts it.
 
     Raises:
         OptionError: `mapping` has a name that is not a class, the detector's names are ambiguous,

@@ -34,8 +34,13 @@ Box = tuple[str, Sequence[float], bool]
 
 
 class LabelledSet(NamedTuple):
-    """Image files by name with their boxes, the names of the classes, and a sentence on each kind
-    of box left out.
+    """Labelled images, read from files.
+
+    Attributes:
+        images: the path of each image with its labelled boxes in pixels of the image, sorted by
+            name.
+        names: the names of the classes; the class indices of the boxes refer to them.
+        notes: sentences for the reader of results, such as on boxes that were left out.
     """
 
     images: list[tuple[Path, Boxes]]
@@ -44,8 +49,14 @@ class LabelledSet(NamedTuple):
 
 
 class _File(NamedTuple):
-    """The labels of one image. `size_px` is the height and width that they were made for, or 0 if
-    they state none.
+    """The labels of one image.
+
+    Attributes:
+        image: the path of the image.
+        source: the path of the file of the labels.
+        boxes: the labelled boxes.
+        size_px: the height and width of the image for which the labels were made; 0 if they state
+            no size.
     """
 
     image: Path
@@ -57,13 +68,18 @@ class _File(NamedTuple):
 def read_labelled(
     images: Path, labels: Path | None = None, split: str | None = None
 ) -> LabelledSet:
-    """Read the labelled images of a folder.
+    """Read the labelled images of a folder, in the formats of Pascal VOC, DIOR or COCO.
 
     Args:
-        images: the folder of the images, or the top of a tree in the layout of VOC and DIOR.
-        labels: a folder of label files, one for each image, or COCO's JSON; None searches next to
-            the images.
-        split: the part of a tree; None uses `test` if there is one.
+        images: the folder of the images, or the top of a folder tree in the layout of VOC and DIOR.
+        labels: a folder of VOC's XML files, one for each image, or the path of COCO's JSON file;
+            None searches next to the images.
+        split: the name of a list of images in a tree of VOC or DIOR, such as "test"; None uses
+            "test" if there is one, else all images.
+
+    Raises:
+        OptionError: labels are missing, damaged, of another image size or without any object, or
+            there is no such split.
     """
     is_tree = (images / "Annotations").is_dir() and any(images.glob("JPEGImages*"))
     if labels is None and is_tree:

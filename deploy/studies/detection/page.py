@@ -46,11 +46,13 @@ NOTES = (
 
 
 def write_page(compared: Sequence[Comparison], table: Table, path: Path) -> None:
-    """Write the page of a study, atomically.
+    """Write the HTML page of a detection study: headline, tables, and crops with boxes.
+
+    The old page, if there is one, is replaced only by the whole new one.
 
     Args:
-        compared: comparisons of one set of scenes.
-        table: the table of their figures.
+        compared: the detections under each sensor, on one set of scenes.
+        table: the table of their figures, as `detection_table` returns it.
         path: the path of the page.
     """
     tables = [
@@ -67,8 +69,10 @@ def write_page(compared: Sequence[Comparison], table: Table, path: Path) -> None
 
 
 def crops(compared: Sequence[Comparison]) -> list[Picture]:
-    """Return the same crops of the scenes that lose most objects, with a row for each sensor and a
-    column for each method.
+    """Draw a picture for each of the few scenes on which degradation loses most objects.
+
+    A picture shows the same crop with a row for each sensor and a column for each method, and boxes
+    for objects that are found, missed and false.
     """
     losses = [
         sum(int(_missed_objects(comparison, number).sum()) for comparison in compared)

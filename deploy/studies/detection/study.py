@@ -39,15 +39,15 @@ REFERENCE = "reference"
 
 @dataclass(frozen=True)
 class LabelledScene:
-    """A scene, and the objects in it that the detector knows.
+    """A scene with labelled objects, before any sensor acquires it.
 
     Attributes:
         name: the name of the file.
-        site: its place; scenes of one site resemble one another.
-        truth: labelled boxes in scene pixels, of the detector's classes.
+        site: the place of the scene; scenes of one site resemble one another.
+        truth: the labelled boxes in scene pixels, of the classes that the detector knows.
         path: the path of the file; None for a scene in memory.
-        radiance: returns the scene (H, W) in W/m2/sr/um. A picture's white is the full scale of the
-            given sensor.
+        radiance: reads the scene, and returns it as (H, W) in W/m2/sr/um. The white of a photograph
+            is the full scale of the given instrument.
     """
 
     name: str
@@ -59,21 +59,31 @@ class LabelledScene:
 
 @dataclass(frozen=True)
 class SensorPair:
-    """The degrading sensor, and the reference sensor converted to its units."""
+    """The two sensors that acquire each scene.
+
+    Attributes:
+        degraded: the profile of the sensor whose images are restored.
+        reference: the profile of the better sensor, in the digital numbers of the first.
+    """
 
     degraded: Sensor
     reference: Sensor
 
     @property
     def oversampling(self) -> int:
-        """Scene pixels per pixel."""
+        """The number of scene pixels per pixel of both sensors, along either side."""
         return int(self.degraded.oversampling.low)
 
 
 @dataclass(frozen=True)
 class AcquiredScene:
-    """A scene in front of two sensors, under one draw of them and of the noise. It is acquired on
-    demand.
+    """A scene as two sensors acquire it. The images are simulated when they are first asked for.
+
+    Attributes:
+        scene: the scene with its labels.
+        sensors: the profiles of the two sensors.
+        draw: the key of the random draws: of each sensor from the ranges of its profile, and of the
+            noise.
     """
 
     scene: LabelledScene
@@ -82,27 +92,38 @@ class AcquiredScene:
 
     @cached_property
     def reference(self) -> np.ndarray:
-        """The digital numbers (h, w) of the reference sensor."""
+        """The image of the reference sensor, digital numbers (h, w)."""
         return self._acquired(self.sensors.reference, REFERENCE)
 
     @cached_property
     def degraded(self) -> np.ndarray:
-        """The digital numbers (h, w) of the degrading sensor."""
+        """The image of the degrading sensor, digital numbers (h, w)."""
         return self._acquired(self.sensors.degraded, DEGRADED)
 
     def shown(self, method: Method | None) -> np.ndarray:
-        """Return the image for a detector, (h, w, 3) float32 in 0 to 1: restored by a method, or
-        the reference for None.
+        """Return the image that a detector is shown.
 
-        All rows of a scene are displayed in the same way, with the stretch of the reference.
+        All images of a scene have the contrast stretch of the reference, so that they compare.
+
+        Args:
+            method: the method that restores the degraded image; None shows the reference image.
+
+        Returns:
+            The image (h, w, 3), float32 in 0 to 1.
         """
         # All rows of a scene share the stretch of the reference, so that contrast compares.
         dn = self.reference if method is None else method.restore(self.degraded)
         return stretch_of(self.reference).to_srgb(dn)
 
     def boxes(self, detector: Detector, method: Method | None) -> Boxes:
-        """Return the detections on the image, in scene pixels. The arguments are those of
-        `shown`.
+        """Run a detector on the image that `shown` returns.
+
+        Args:
+            detector: the detector.
+            method: the method that restores the degraded image; None for the reference image.
+
+        Returns:
+            The detected boxes in scene pixels.
         """
         detections = detector.detect(self.shown(method))
         return replace(detections, corners=detections.corners * self.sensors.oversampling)
@@ -115,17 +136,18 @@ class AcquiredScene:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The detections under one pair of sensors.
+    """The results of a detector under one pair of sensors, on the same scenes shown in several ways
+    (the rows): the reference, degraded and restored images.
 
     Attributes:
-        sensors: as they are stated.
-        methods: by the names of the rows; None is the reference, which is first.
-        scenes: in front of the sensors.
-        boxes: the detections on each scene, by row.
-        hits: which of them found an object, by row.
-        figures: by row.
+        sensors: the profiles of the two sensors.
+        methods: the method of each row by its name; the reference is the first row, with None.
+        scenes: the scenes as the sensors acquire them.
+        boxes: for each row the detections on each scene, in scene pixels.
+        hits: for each row the same detections, matched with the labelled objects.
+        figures: for each row its figures by name, on all images and on each bootstrap draw.
         confidence: the confidence at which precision and recall are sampled in every row.
-        names: the names of the classes.
+        names: the names of the detector's classes.
     """
 
     sensors: SensorPair
@@ -144,7 +166,7 @@ class Comparison:
 
     @property
     def sites(self) -> int:
-        """The number of different sites."""
+        """The number of different sites of the scenes."""
         return len({acquired.scene.site for acquired in self.scenes})
 
 
@@ -157,16 +179,23 @@ def run_study(
     reference: SensorLike | None = None,
     seed: int = 0,
 ) -> list[Comparison]:
-    """Run a detector on the same scenes as the reference sees them, degraded and restored, under
-    each sensor.
+    """Measure how well a detector finds objects on reference, degraded and restored images of the
+    same scenes.
 
     Args:
-        detector: the detector that runs on the images.
-        scenes: labelled.
-        sensors: the sensors of the degraded images.
-        methods: names of the rows besides the reference, the degraded images among them.
-        reference: profile of the reference images; None for the default one.
+        detector: the detector.
+        scenes: the scenes with their labels.
+        sensors: the sensors of the degraded images, each compared by itself.
+        methods: the names of the methods that make a row, the degraded input among them. The
+            reference is a row in any case.
+        reference: the profile of the reference images; None for the default one.
         seed: the seed of every random draw.
+
+    Returns:
+        The results under each sensor, in the order of `sensors`.
+
+    Raises:
+        OptionError: there is no such method.
     """
     cases = []
     # A method that does not exist is refused before anything is detected.
@@ -205,8 +234,8 @@ def _compared(
 def acquired(
     scenes: Sequence[LabelledScene], sensors: SensorPair, seed: int
 ) -> Iterator[AcquiredScene]:
-    """Yield every scene in front of the sensors. The noise depends on the seed and the scene's
-    number.
+    """Yield every scene as the sensors acquire it. The noise of a scene depends on the seed and on
+    its index in `scenes`.
     """
     for number, scene in enumerate(scenes):
         yield AcquiredScene(scene, sensors, Draw(seed, number))
@@ -219,15 +248,22 @@ def labelled_scenes(
     labels: Path | None = None,
     split: str | None = None,
 ) -> tuple[list[LabelledScene], list[str]]:
-    """Return the labelled pictures of a folder as scenes, which are read on demand, and sentences
-    on what is left out.
+    """Read the labels of a folder of pictures, and return the pictures as scenes, whose pixels are
+    read on demand.
 
     Args:
         names: the names of the classes that the detector knows.
-        mapping: the detector's names by labelled ones, where letters do not match.
-        images: as `read_labelled` accepts it.
-        labels: their path, if not next to the pictures.
-        split: the part of a tree.
+        mapping: the detector's name by the labelled name, for classes whose names differ.
+        images: the folder of the pictures, or the top of a folder tree of VOC or DIOR.
+        labels: the folder or file of the labels; None searches next to the pictures.
+        split: the name of a list of images in a tree of VOC or DIOR; None uses "test" if there is
+            one.
+
+    Returns:
+        The scenes, and sentences for the reader of results on labels that are left out.
+
+    Raises:
+        OptionError: the labels cannot be read, or no labelled class is one of the detector's.
     """
     labelled = read_labelled(images, labels, split)
     numbers = class_numbers(labelled.names, names, mapping)

@@ -40,11 +40,11 @@ def detection_table(
     scenes: Sequence[LabelledScene],
     notes: Sequence[str],
 ) -> Table:
-    """Return the figures of a study.
+    """Arrange the figures of a detection study as a table of results.
 
     Args:
-        compared: comparisons under each sensor.
-        file: path of the detector.
+        compared: the results under each sensor.
+        file: the path of the detector's file.
         detector: the detector that ran on the scenes.
         scenes: the scenes with their labels.
         notes: sentences that a reader must know about the labels.
@@ -61,8 +61,10 @@ def detection_table(
 
 
 def detection_rows(comparison: Comparison) -> list[Row]:
-    """Return the tables of one sensor: the main result, each row at its own confidence, by class
-    and by size.
+    """Return the rows of all tables on one sensor.
+
+    The tables are the main result, precision and recall of each row at the confidence that is best
+    for it, mAP50 by class, and mAP50 by size of the objects.
     """
     # A class without a labelled object has no average precision.
     by_class = {
@@ -108,8 +110,12 @@ def _main_row(comparison: Comparison, row: str) -> Row:
 
 
 def verdict(difference: np.ndarray, sites: int) -> str:
-    """Return the conclusion from a paired difference (1 + draws,) over `sites` sites. If its
-    interval contains 0, there is no difference.
+    """State in words if a difference of two rows is a gain, a loss, or none because its interval
+    contains 0.
+
+    Args:
+        difference: the difference on all images, then on each bootstrap draw, (1 + draws,).
+        sites: the number of different sites; with too few there is no interval, and no conclusion.
     """
     ends = interval(difference, sites)
     if ends is None:
@@ -168,7 +174,9 @@ PAPER_COLUMNS = ("mAP50", "mAP90 (sic)", "precision", "recall")
 
 
 def paper_rows() -> list[Row]:
-    """Return the paper's table as printed, with the differences to ours."""
+    """Return the rows of the detection table that the ConvBEERS paper prints, each with words on
+    what differs from this study.
+    """
     rows = []
     for name, values in PAPER.items():
         figures = [published(value, PERCENT, SOURCE) for value in values]
@@ -195,8 +203,8 @@ PAPER_NOTES = (
 
 
 def headline(compared: Sequence[Comparison]) -> str:
-    """Return a sentence for each sensor: the loss, and the part that the last of the methods
-    recovers.
+    """Return the sentences at the top of the page, one for each sensor: the loss of mAP50 by
+    degradation, and the part of it that the last of the methods recovers.
     """
     sentences = []
     for comparison in compared:

@@ -23,14 +23,20 @@ SUFFIXES = (".onnx", ".safetensors")
 
 
 def network_to_calibrate(methods: Mapping[str, Any], out: Path) -> tuple[str, Path]:
-    """Return the name of the method whose network is calibrated, and the file of that network.
+    """Return which of the compared methods `evaluate --calibrate` calibrates: the only file of a
+    network.
 
     Args:
-        methods: what is compared, by name.
-        out: the copy to write.
+        methods: the compared methods (names, paths, networks or functions), by the name of their
+            row.
+        out: the path of the calibrated copy to write.
+
+    Returns:
+        The name of the method, and the path of its network's file.
 
     Raises:
-        OptionError: none or several files of networks, or a copy of another suffix.
+        OptionError: none or several methods are files of networks, or `out` has another suffix than
+            the file.
     """
     # NAME@SENSOR names a file with another sensor.
     named = {name: Path(str(source).partition("@")[0]) for name, source in methods.items()}
@@ -49,13 +55,19 @@ def network_to_calibrate(methods: Mapping[str, Any], out: Path) -> tuple[str, Pa
 
 
 def calibrate_network(evaluation: Evaluation, name: str, source: Path, out: Path) -> None:
-    """Write a copy of a network's file with the interval that fits an evaluation.
+    """Fit the interval of a network's restored pixels on the pairs of an evaluation, and store it
+    in a copy of the network's file.
+
+    The interval of a pixel is the range that its true value lies in with a stated probability.
 
     Args:
-        evaluation: the evaluation.
-        name: the name of the method that is the network.
-        source: the file.
-        out: the copy.
+        evaluation: the evaluation, whose pairs show the error of the network.
+        name: the name of the network among the methods of the evaluation.
+        source: the path of the network's file, ONNX or safetensors.
+        out: the path of the copy.
+
+    Raises:
+        ImageError: all pairs are of one site.
     """
     (method,) = (method for method in evaluation.methods if method.name == name)
     interval = interval_from_pairs(evaluation.pairs, method.restore, evaluation.sensors[0])
@@ -67,17 +79,19 @@ def calibrate_network(evaluation: Evaluation, name: str, source: Path, out: Path
 def interval_from_pairs(
     pairs: Sequence[NamedPair], restore: Restore, sensor: Sensor
 ) -> PixelInterval:
-    """Fit the interval of a restoration: its exponents on every second site, its quantiles on the
-    others.
+    """Fit the interval of a method's restored pixels, by the formula of `model.interval`.
+
+    The sites of the pairs are split in two halves: one fits how the half-width grows with detail,
+    blur and noise, the other the factor that makes the interval hold the stated share of pixels.
 
     Args:
         pairs: the pairs of at least two sites. The truth is the reference without noise where it is
-            known.
-        restore: the restoration.
-        sensor: the sensor that acquired the pairs.
+            known, else the reference.
+        restore: the method, a function from degraded to restored digital numbers (H, W).
+        sensor: the sensor that acquired the degraded images.
 
     Raises:
-        ImageError: pairs of one site alone.
+        ImageError: all pairs are of one site.
     """
     sites = sorted({pair.site for pair in pairs})
     if len(sites) < 2:
@@ -96,10 +110,14 @@ def interval_from_pairs(
 
 
 def write_with_interval(source: Path, interval: PixelInterval, out: Path) -> None:
-    """Write a copy of a network's file with an interval.
+    """Write a copy of a network's file that also states the interval of its restored pixels.
 
-    Weights, integers and results stay as they are; a float ONNX file becomes its simplest equal, as
-    in all that is made of it.
+    The network's results stay the same. A float ONNX file is written in its simplified form.
+
+    Args:
+        source: the path of the network's file, ONNX or safetensors.
+        interval: the calibrated interval.
+        out: the path of the copy.
     """
     text = interval.to_json()
     if source.suffix == ".safetensors":

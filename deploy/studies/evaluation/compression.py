@@ -55,11 +55,11 @@ the requested rate, and the nearest code counts.
 
 @dataclass(frozen=True)
 class Decompressed:
-    """An image after compression.
+    """An image that was compressed and decompressed again.
 
     Attributes:
-        dn: digital numbers (H, W) float32.
-        rate: the rate of its code, in bits per pixel.
+        dn: the digital numbers (H, W) float32 after decompression.
+        rate: the size of the compressed image, in bits per pixel.
     """
 
     dn: np.ndarray
@@ -67,11 +67,11 @@ class Decompressed:
 
 
 def check_rates(rates: Iterable[float], bits: int) -> list[float]:
-    """Return the rates without duplicates.
+    """Check the compression rates that a user gives, and return them without duplicates.
 
     Args:
-        rates: in bits per pixel.
-        bits: the bits of the sensor.
+        rates: the sizes to which images are compressed, in bits per pixel.
+        bits: the number of bits of the sensor's digital numbers.
 
     Raises:
         OptionError: a rate is not above 0 and at most the bits of the sensor.
@@ -87,22 +87,23 @@ def check_rates(rates: Iterable[float], bits: int) -> list[float]:
 
 
 def lossless_rate(dn: np.ndarray, bits: int) -> float:
-    """Return the bits per pixel of lossless JPEG 2000, with the reversible 5/3 wavelet.
+    """Compress an image by lossless JPEG 2000, with the reversible 5/3 wavelet, and return the size
+    in bits per pixel.
 
     Args:
-        dn: digital numbers (H, W), which are rounded.
-        bits: the bits of a digital number.
+        dn: digital numbers (H, W), which are rounded first.
+        bits: the number of bits of a digital number.
     """
     return 8 * len(_code(_rounded(dn, bits))) / dn.size
 
 
 def decompressed(dn: np.ndarray, rate: float, bits: int) -> Decompressed:
-    """Compress an image, and decompress it.
+    """Compress an image by JPEG 2000 with the 9/7 wavelet, and decompress it.
 
     Args:
-        dn: digital numbers (H, W), which are rounded.
-        rate: in bits per pixel.
-        bits: the bits of a digital number.
+        dn: digital numbers (H, W), which are rounded first.
+        rate: the requested size in bits per pixel. The size that is nearest to it is used.
+        bits: the number of bits of a digital number.
     """
     # OpenJPEG controls the rate more finely if the upper bits of the container are used. The error
     # at a rate is the same within 0.5 %.
@@ -139,15 +140,18 @@ def _code(image: np.ndarray, **options: object) -> bytes:
 
 @dataclass(frozen=True)
 class Trial:
-    """PSNRs and rates of a method at one rate, image by image.
+    """The measurements of one method at one compression rate, for N images.
 
     Attributes:
-        board_db: PSNR of the images restored on board, (N,).
-        ground_db: PSNR of those restored on the ground, by the share of the error that counts as
-            noise, (S, N); of a method that uses no sensor profile, S is 1.
-        rates: the rates of the codes on board and on the ground, in bits per pixel, (2, N).
-        error_dn2: mean squared error of the images that reach the ground, (N,).
-        sites: the sites of the images, (N,).
+        board_db: PSNR in dB of the images that were restored on board and then compressed, (N,).
+        ground_db: PSNR in dB of the images that were compressed and then restored on the ground,
+            (S, N). Each row counts another of the `SHARES` of the compression's error as noise of
+            the sensor; S is 1 for a method that uses no sensor profile.
+        rates: the sizes of the compressed images on board and on the ground, in bits per pixel,
+            (2, N).
+        error_dn2: mean squared error of the compressed raw images, in squared digital numbers,
+            (N,).
+        sites: the places of the images, (N,). Images of one site resemble one another.
     """
 
     board_db: np.ndarray
@@ -158,7 +162,9 @@ class Trial:
 
     @property
     def chosen(self) -> np.ndarray:
-        """The number of the share that each image is restored with, (N,)."""
+        """For each image the index in `SHARES` that is best on the images of other sites, (N,), so
+        that the choice does not see the image itself. A single site chooses for itself.
+        """
         sites = np.asarray(self.sites)
         numbers = np.empty(len(sites), int)
         for site in np.unique(sites):
@@ -169,7 +175,13 @@ class Trial:
         return numbers
 
     def row(self, name: str, seed: int) -> Row:
-        """Return the row of the table; the seed is that of the bootstrap."""
+        """Return the row of results of this method and rate: mean PSNRs and rates, and the gain of
+        restoring on board with its interval.
+
+        Args:
+            name: the name of the row.
+            seed: the seed of the bootstrap over sites, which gives the interval.
+        """
         shares = self.chosen
         ground = self.ground_db[shares, np.arange(len(shares))]
         gain = self.board_db - ground
@@ -207,14 +219,15 @@ def run_compression(
     rates: Sequence[float],
     seed: int,
 ) -> list[Row]:
-    """Restore images on board and on the ground, at each rate.
+    """Compare restoration on board, before compression, with restoration on the ground, after it.
 
     Args:
-        methods: the methods; the degraded input is left out.
-        pairs: the pairs of images.
-        sensor: the sensor that acquired the images.
-        rates: in bits per pixel; without any, no row is returned.
-        seed: the seed of the bootstrap.
+        methods: the compared methods; the degraded input itself is left out.
+        pairs: the pairs of a degraded and a reference image.
+        sensor: the sensor that acquired the degraded images.
+        rates: the sizes to which images are compressed, in bits per pixel; if empty, no row is
+            returned.
+        seed: the seed of the bootstrap over sites, which gives the intervals.
 
     Returns:
         A row for each method and rate, then one for each method with its lossless rates.
@@ -248,15 +261,15 @@ def try_method(
     rate: float,
     sensor: Instrument,
 ) -> Trial:
-    """Compare both orders of a method at one rate.
+    """Measure one method at one rate, once before compression and once after it.
 
     Args:
         method: the method that restores.
-        pairs: the pairs of images.
-        restored: the degraded images of the pairs, restored.
-        raw: the same images, decompressed.
-        rate: in bits per pixel.
-        sensor: the sensor that acquired the images.
+        pairs: the pairs of a degraded and a reference image.
+        restored: the degraded image of each pair, restored by the method, (H, W) each.
+        raw: the degraded image of each pair, compressed and decompressed.
+        rate: the size to which the restored images are compressed, in bits per pixel.
+        sensor: the sensor that acquired the degraded images.
     """
     sent = [decompressed(image, rate, sensor.bits) for image in restored]
     shares = SHARES if method.specialise else SHARES[:1]

@@ -61,14 +61,15 @@ BLIND = "blind"
 
 @dataclass(frozen=True)
 class Method:
-    """A restoration with the name it is listed under, and its knowledge of the sensor.
+    """A way to restore images that an evaluation compares with others: a network, the traditional
+    pipeline, a function of the user, or no restoration at all.
 
     Attributes:
-        name: in tables.
-        restore: the restoration.
-        sensor_known: the knowledge of the sensor that the restoration uses, in words.
-        specialise: returns the restoration for another known sensor; None if it does not depend on
-            a sensor.
+        name: the name in tables.
+        restore: the function from degraded to restored digital numbers, (H, W) each.
+        sensor_known: what the method knows of the sensor, in words: known, blind or another one.
+        specialise: returns the function `restore` of the same method for another sensor; None if
+            the method does not depend on a sensor, or always assumes the same one.
     """
 
     name: str
@@ -77,15 +78,22 @@ class Method:
     specialise: Specialise | None = None
 
     def with_sensor(self, sensor: Instrument) -> "Method":
-        """Return this method for the given sensor, or itself if it does not depend on a sensor."""
+        """Return this method for images of the given sensor, or the method itself if `specialise`
+        is None.
+        """
         if self.specialise is None:
             return self
         return replace(self, restore=self.specialise(sensor), sensor_known=KNOWN)
 
 
 def method_without_network(name: str, degraded: Instrument, reference: Instrument) -> Method:
-    """Return the method of WITHOUT_NETWORK: the input itself, or a traditional method that knows
-    both sensors.
+    """Build a method that needs no network: the degraded input itself, a traditional pipeline, or a
+    baseline of scikit-image.
+
+    Args:
+        name: one of `WITHOUT_NETWORK`.
+        degraded: the sensor of the degraded images, which all but the input itself know.
+        reference: the sensor that the restoration aims at.
     """
     if name == DEGRADED:
         return Method(name, lambda dn: dn, "the input itself")
@@ -107,14 +115,20 @@ METHOD_NAMES = (
 
 
 def method_named(name: str, degraded: Sensor, reference: Sensor, around: Around = BOTH) -> Method:
-    """Return the method of that name. The traditional ones know both sensors, a shipped network the
-    degraded one.
+    """Build the method that a user names in `methods`.
+
+    Traditional methods know both sensors, a shipped network the degraded one.
 
     Args:
-        name: one of METHOD_NAMES.
-        degraded: the sensor of the images.
-        reference: the sensor that is aimed at.
-        around: the steps around a network that are used.
+        name: one of METHOD_NAMES: a traditional method, a shipped network or a network's file.
+            NETWORK@SENSOR tells the network another sensor than the images'.
+        degraded: the sensor of the degraded images.
+        reference: the sensor that the restoration aims at.
+        around: the steps around a network that are used: exposures and the consistency step.
+
+    Raises:
+        OptionError: there is no such method.
+        BeersError: the network or the sensor cannot be loaded.
     """
     if name in WITHOUT_NETWORK:
         return method_without_network(name, degraded.nominal(), reference.nominal())
@@ -156,15 +170,16 @@ def method_of(
     around: Around = BOTH,
     acquired_by: str = "",
 ) -> Method:
-    """Return a network as a method.
+    """Build a method from a loaded network and the steps around it.
 
     Args:
-        name: in tables.
-        network: float or INT8.
+        name: the name of the method in tables.
+        network: the network, float or INT8.
         sensor: the sensor that the steps around the network use.
-        reference: the sensor that is aimed at.
-        around: the steps that are used.
-        acquired_by: the name of the images' sensor; that of `sensor` if empty.
+        reference: the sensor that the restoration aims at.
+        around: the steps that are used: exposures and the consistency step.
+        acquired_by: the name of the images' sensor, which decides if the network knows it; empty
+            for the name of `sensor`.
     """
     restore = network_restore(network, sensor, reference.nominal(), around)
     return Method(name, restore, knowledge_of(network.model, acquired_by or sensor.name))
@@ -173,8 +188,19 @@ def method_of(
 def network_restore(
     network: Network, sensor: Sensor, reference: Instrument, around: Around
 ) -> Restore:
-    """Return the restoration by a network with the steps around it, in which dark parts are
-    restored at a higher exposure.
+    """Build the function that restores an image by a network and the steps around it.
+
+    Args:
+        network: the network, float or INT8.
+        sensor: the sensor of the images. The sensor named "blind" is unknown, and the consistency
+            step is then omitted.
+        reference: the sensor that the restoration aims at.
+        around: the steps that are used: exposures, at which dark parts are multiplied by a factor
+            before the network, and the consistency step, which makes the result agree with the raw
+            image.
+
+    Returns:
+        A function from degraded to restored digital numbers, (H, W) each.
     """
     exposures = exposures_of(network, around)
     brighter = {factor: other.model for factor, other in exposures.items()}
@@ -187,7 +213,13 @@ def network_restore(
 
 
 def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:
-    """Return which sensor a network knows: the one with that name, none, or another one."""
+    """Return in words what a network knows of the sensor of the images: "known", "blind" or
+    "another: NAME".
+
+    Args:
+        model: the network, whose metadata names the sensor that it was conditioned on.
+        sensor_name: the name of the images' sensor.
+    """
     own = metadata(model).get("sensor", "")
     # A file without a sensor in its metadata was conditioned on none.
     if own in ("", NOT_KNOWN, BLIND_PROFILE):
@@ -196,7 +228,12 @@ def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:
 
 
 def profile_of(sensor: Instrument, like: Sensor) -> Sensor:
-    """Return a profile from which every draw is that sensor, in the grid of another profile."""
+    """Convert an instrument to a sensor profile without ranges, named "drawn".
+
+    Args:
+        sensor: the instrument, whose MTF, noise, gain and bits the profile gets.
+        like: the profile from which all other fields are copied, such as the oversampling.
+    """
     across, along = sensor.mtf_axes
     numbers = {
         "mtf_nyquist": across,

@@ -24,14 +24,19 @@ OVERSAMPLINGS = (4, 2)
 
 @dataclass(frozen=True)
 class NamedPair:
-    """Two acquisitions of one scene, (H, W) float32 digital numbers of the same units, and the
-    scene's name.
+    """A pair of images of one scene, on which methods are compared.
 
     Attributes:
-        place: its site, if it is known by more than the name.
-        oversampling: scene pixels per pixel, if the pair was simulated here.
-        noise_free: the reference without noise and rounding, (H, W) float32, if the pair was
-            simulated here.
+        name: the name of the scene.
+        degraded: the image of the sensor, which methods restore, (H, W) float32 digital numbers.
+        reference: the image of the better sensor that restorations aim at, (H, W) float32 digital
+            numbers of the degraded sensor.
+        place: the site of the scene, if the recipe of the pairs states it; None derives it from the
+            name.
+        oversampling: scene pixels per pixel along either side, if the pair was simulated from a
+            scene here; else None.
+        noise_free: the reference without noise and rounding, (H, W) float32; None if it is not
+            known.
     """
 
     name: str
@@ -43,8 +48,8 @@ class NamedPair:
 
     @property
     def site(self) -> str:
-        """The place if it is known, else the name without the parts that distinguish frames of one
-        site.
+        """The site, by which images of one place are grouped: `place` if it is stated, else the
+        name without the number of the frame.
         """
         return self.place or site_of(self.name)
 
@@ -52,15 +57,21 @@ class NamedPair:
 def pairs_of_scenes(
     images: Path | None, degraded: Sensor, reference: Sensor, seed: int, brightness: float = 1.0
 ) -> tuple[list[NamedPair], list[str]]:
-    """Simulate pairs from the scenes of a folder, or from drawn ones, and return them with notes
-    for the reader.
+    """Simulate a pair of images from each scene of a folder, or from each of some drawn scenes.
 
     Args:
-        images: the folder; drawn scenes if None.
-        degraded: profile of the degraded images.
-        reference: profile of the reference images.
+        images: the folder of photographs or radiances that are the scenes; None draws scenes.
+        degraded: the profile of the sensor of the degraded images.
+        reference: the profile of the sensor of the reference images.
         seed: the seed of every random draw.
-        brightness: factor of the scenes' radiance.
+        brightness: the factor by which the radiance of the scenes is multiplied.
+
+    Returns:
+        The pairs, and sentences for the reader of the results: on scenes that were too small, and
+        on an oversampling other than the profile's.
+
+    Raises:
+        ImageError: all scenes are too small.
     """
     scenes = scenes_at(brightness, load_scenes(images, reference.nominal(), seed))
     pairs, small = simulate_pairs(scenes, degraded, reference, seed, oversamplings_of(degraded))
@@ -69,18 +80,27 @@ def pairs_of_scenes(
 
 
 def scenes_at(brightness: float, scenes: Iterable[Scene]) -> list[Scene]:
-    """Return the scenes with their radiance multiplied by a factor."""
+    """Return scenes whose radiance is multiplied by the factor `brightness`."""
     factor = np.float32(brightness)
     return [replace(scene, radiance=scene.radiance * factor) for scene in scenes]
 
 
 def table_at(brightness: float, name: str) -> str:
-    """Return the name of a table of scenes whose radiance was multiplied by a factor."""
+    """Return the name of a table on dimmed scenes: `name` with the factor of their radiance.
+
+    Args:
+        brightness: the factor by which the radiance of the scenes was multiplied; 1 adds nothing.
+        name: the name of the same table on scenes that are not dimmed.
+    """
     return name if brightness == 1 else f"{name}, radiance x {brightness:g}"
 
 
 def check_brightness(brightness: Iterable[float]) -> list[float]:
-    """Return 1 and the other factors of radiance, without duplicates.
+    """Check the factors of radiance that a user gives, and return 1 and the others without
+    duplicates.
+
+    Args:
+        brightness: the factors by which the radiance of scenes is multiplied.
 
     Raises:
         OptionError: a factor is not above 0 and at most 1.
@@ -102,18 +122,22 @@ def simulate_pairs(
     seed: int,
     oversamplings: Sequence[int] = OVERSAMPLINGS,
 ) -> tuple[list[NamedPair], list[str]]:
-    """Simulate a pair from each scene, at the first of the oversamplings at which the pair is large
-    enough.
+    """Simulate a pair of images from each scene.
 
     Args:
-        scenes: the scenes.
-        degraded: the same sensor for all scenes, or a profile from which one is drawn for each.
-        reference: likewise.
+        scenes: the radiances that the sensors acquire.
+        degraded: the sensor of the degraded images: one instrument for all scenes, or a profile
+            from which one is drawn for each scene.
+        reference: the sensor of the reference images, an instrument or a profile, too.
         seed: the seed of every random draw.
-        oversamplings: scene pixels per pixel.
+        oversamplings: numbers of scene pixels per pixel, in the order of preference. Each scene is
+            acquired at the first at which its pair is large enough.
 
     Returns:
-        The pairs, and the names of scenes too small to use.
+        The pairs, and the names of scenes that are too small to use.
+
+    Raises:
+        ImageError: all scenes are too small.
     """
     pairs = []
     small = []
@@ -144,17 +168,20 @@ def simulate_pairs(
 
 
 def oversamplings_of(profile: Sensor) -> tuple[int, ...]:
-    """Return the profile's oversampling, limited to 4, and 2 for scenes that are too small for it.
+    """Return the numbers of scene pixels per pixel at which pairs are simulated for a sensor, in
+    the order of preference.
 
-    At more than 4 little would be left of a photograph, and at 4 the blur is sampled finely enough.
+    The first is that of the profile, but at most 4: at more than 4 little would be left of a
+    photograph, and at 4 the blur is sampled finely enough. The second, at most 2, is for scenes
+    that are too small for the first.
     """
     own = int(profile.oversampling.low)
     return tuple(dict.fromkeys(min(own, ratio) for ratio in OVERSAMPLINGS))
 
 
 def oversampling_note(pairs: Sequence[NamedPair], profile: Sensor) -> str:
-    """Return a sentence if pairs were simulated at another oversampling than the profile's, else
-    "".
+    """Return a sentence for the reader of the results if some pairs were simulated at another
+    number of scene pixels per pixel than the profile states; else an empty text.
     """
     own = int(profile.oversampling.low)
     ratios = {pair.oversampling for pair in pairs if pair.oversampling is not None}
@@ -170,9 +197,17 @@ def oversampling_note(pairs: Sequence[NamedPair], profile: Sensor) -> str:
 def read_pairs(
     folder: Path, max_dn: int = MAX_DN, recipe: PairsRecipe | None = None
 ) -> list[NamedPair]:
-    """Read FOLDER/degraded/NAME.tif and FOLDER/reference/NAME.tif, mono images of 0 to max_dn.
+    """Read stored pairs of images, such as `simulate` writes.
 
-    With the recipe of the folder, the sites are those of the scenes that it names.
+    Args:
+        folder: the folder with degraded/NAME.tif and reference/NAME.tif, images of one band.
+        max_dn: the largest digital number; by default that of 12 bits.
+        recipe: the recipe that `simulate` wrote next to the pairs, which names the site of each
+            scene; None derives sites from the names of the files.
+
+    Raises:
+        ImageError: an image cannot be read or has values outside 0 to `max_dn`, or the two images
+            of a pair differ in size.
     """
     pairs = []
     for degraded, reference in pair_files(folder):

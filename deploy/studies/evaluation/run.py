@@ -52,12 +52,13 @@ from beers_deploy.studies.evaluation.sweep import run_sweep
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Evaluation(Table):
-    """Methods compared on the same pairs: means, sites, images, and other sensors if requested.
+    """The table of results of `evaluate`: scores of methods on the same pairs, as means, by site
+    and by image, and under other sensors if requested.
 
     Attributes:
         sensors: the sensors of the degraded and of the reference images.
-        methods: as they were run.
-        pairs: the pairs that they were run on.
+        methods: the compared methods, of which the first is the degraded input itself.
+        pairs: the pairs of a degraded and a reference image that the methods restored.
     """
 
     sensors: tuple[Sensor, Sensor]
@@ -65,7 +66,7 @@ class Evaluation(Table):
     pairs: Sequence[NamedPair]
 
     def report(self, folder: str | os.PathLike[str]) -> Path:
-        """Write report.html and pictures into a folder, and return the page's path."""
+        """Write report.html and its pictures into a folder, and return the path of the page."""
         page = Path(folder) / "report.html"
         write_report(evaluation_report(self, pictures(self.pairs, self.methods, page.parent)), page)
         return page
@@ -73,20 +74,21 @@ class Evaluation(Table):
 
 @dataclass(frozen=True)
 class Plan:
-    """The settings of a comparison.
+    """The checked options of `evaluate`.
 
     Attributes:
-        methods: names, networks or functions, by the name of their row.
+        methods: the compared methods by the name of their row: a name, a network, or a function
+            from degraded to restored digital numbers (H, W).
         sensors: the sensors of the degraded and of the reference images.
-        scenes: folder of scenes to simulate pairs from; None for drawn ones.
+        scenes: the folder of scenes to simulate pairs from; None for drawn scenes.
         folder: the folder of stored pairs; None if there are none.
-        given: pairs in memory; None if there are none.
-        lpips: weights for LPIPS, or None.
-        factors: the factors of the scenes' radiance; the first is 1.
-        rates: bits per pixel to which images are compressed before or after restoration.
-        sweep: True to compare other blurs, noises and gains too.
+        given: the pairs in memory; None if there are none.
+        lpips: the file or folder of weights for LPIPS; None for the path in the environment.
+        factors: the factors by which the radiance of scenes is multiplied; the first is 1.
+        rates: the bits per pixel to which images are compressed before or after restoration.
+        sweep: True to compare the methods also under sensors of other blur, noise and gain.
         strict: True to refuse stored pairs that contradict the sensor.
-        around: the steps around networks that are used.
+        around: the steps around networks that are used: exposures and the consistency step.
         seed: the seed of every random draw.
     """
 
@@ -105,7 +107,15 @@ class Plan:
 
 
 def run_evaluation(plan: Plan) -> Evaluation:
-    """Compare restorations on the same pairs and targets. The degraded input is always a row."""
+    """Compare methods on the same pairs, and on targets whose truth is known.
+
+    Args:
+        plan: the checked options of `evaluate`.
+
+    Raises:
+        BeersError: a method, an image or weights cannot be loaded, or stored pairs contradict the
+            sensor and the option `strict` is set.
+    """
     sensors = plan.sensors
     seed = plan.seed
     methods = [_method(name, source, sensors, plan.around) for name, source in plan.methods.items()]
@@ -182,7 +192,7 @@ def _compared(
 
 
 def _in_order(rows: Iterable[Row]) -> list[Row]:
-    """Return the rows by table: means, targets, sites, images; with the sites' means among them."""
+    """Sort rows by table: means, targets, sites, images. The rows of sites are computed here."""
     tables = by_table(rows)
     means = [table for name, table in tables.items() if name.startswith("mean")]
     images = [table for name, table in tables.items() if name.startswith("images")]
@@ -241,10 +251,11 @@ CHECKED_IMAGES = 16
 
 
 def strip_of(pair: NamedPair, methods: Sequence[Method]) -> tuple[np.ndarray, float]:
-    """Draw crops of every method and the reference, with the absolute errors below them.
+    """Draw the same crop of one pair as every method restores it and of the reference, with the
+    absolute errors against the reference below.
 
     Returns:
-        The picture (h, w) uint8, and the error in DN that is shown white.
+        The picture (h, w) uint8, and the error in digital numbers that is shown white.
     """
     images = {method.name: method.restore(pair.degraded) for method in methods}
     images["reference"] = pair.reference
@@ -262,9 +273,8 @@ def strip_of(pair: NamedPair, methods: Sequence[Method]) -> tuple[np.ndarray, fl
 
 
 def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -> list[Picture]:
-    """Draw a strip of crops for each of the first few sites, and write it to OUT/SITE.png.
-
-    A strip shows one pair as each method restores it, with the reference, and below the errors.
+    """Draw a picture of crops, as `strip_of` does, of one pair of each of the first few sites, and
+    write it to OUT/SITE.png.
     """
     # Reversed, so that the first pair of each site is the one that stays.
     by_site = {pair.site: pair for pair in reversed(pairs)}
@@ -283,9 +293,13 @@ def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -
 
 
 def evaluation_report(evaluation: Evaluation, strips: Sequence[Picture]) -> Report:
-    """Return the page: pictures, means, sites, and the sweep if there was one.
+    """Arrange the results of an evaluation as a page: headline, tables, pictures and notes.
 
-    Tables of single images are only in the document.
+    Tables of single images are left out; they are only in the JSON document.
+
+    Args:
+        evaluation: the results.
+        strips: the pictures of the page, as `pictures` draws them.
     """
     tables = []
     for name, rows in by_table(evaluation.rows).items():
@@ -362,7 +376,12 @@ NOTES = (
 
 
 def headline(rows: Sequence[Row]) -> str:
-    """Return a sentence that names the best method by mean PSNR."""
+    """Return the sentence at the top of the page, which names the best method by mean PSNR and
+    compares it with the degraded input.
+
+    Args:
+        rows: all rows of the evaluation; the first measured row of the table 'mean' is the input.
+    """
     means = [row for row in rows if row.table == "mean"]
     ours = [row for row in means if row.figures["PSNR"].mode == "measured"]
     best = max(ours, key=lambda row: row.figures["PSNR"].value or 0.0)

@@ -29,12 +29,15 @@ Perceptual = Callable[[np.ndarray, np.ndarray], float]
 
 
 def perceptual_distances(place: Path | None) -> dict[str, Perceptual | str]:
-    """Return LPIPS-squeeze or the reason why it is unavailable, and LPIPS-vgg and DISTS if VGG16 is
-    found.
+    """Load the perceptual metrics whose pretrained weights are found.
 
     Args:
-        place: a file with SqueezeNet 1.1, or a folder with any of the backbones; None reads the
-            path from the environment.
+        place: a file with the weights of SqueezeNet 1.1, or a folder with those of SqueezeNet 1.1
+            or VGG16; None reads the path from the environment.
+
+    Returns:
+        The metrics by name. LPIPS-squeeze is always there, if need be as the reason why it is
+        unavailable; LPIPS-vgg and DISTS are there if VGG16 is found.
     """
     distances: dict[str, Perceptual | str] = {"LPIPS-squeeze": not_found("squeeze")}
     # A single file is that of SqueezeNet.
@@ -80,12 +83,16 @@ rows compare.
 
 
 def inner_border_px(height: int, width: int) -> int:
-    """Return the border that inner pixels leave out: at most a quarter of the shorter side."""
+    """Return the width in pixels of the border that scores of inner pixels leave out on every side
+    of an image (height, width): `INNER_BORDER_PX`, but at most a quarter of the shorter side.
+    """
     return min(INNER_BORDER_PX, min(height, width) // 4)
 
 
 def inner_note(pairs: Sequence[NamedPair]) -> str:
-    """Return a sentence if some images are too small for the whole border, else ""."""
+    """Return a sentence for the reader of the results if some images are so small that scores of
+    inner pixels leave out a narrower border; else an empty text.
+    """
     small = sum(inner_border_px(*pair.degraded.shape) < INNER_BORDER_PX for pair in pairs)
     if not small:
         return ""
@@ -96,7 +103,7 @@ def inner_note(pairs: Sequence[NamedPair]) -> str:
 
 
 def inner(image: np.ndarray) -> np.ndarray:
-    """Return the inner pixels of an image (H, W)."""
+    """Return an image (H, W) without the border that scores of inner pixels leave out."""
     border_px = inner_border_px(*image.shape)
     height, width = image.shape
     return image[border_px : height - border_px, border_px : width - border_px]
@@ -108,14 +115,19 @@ def bias_percent(
     unclipped: np.ndarray | None = None,
     offset_dn: float = 0.0,
 ) -> float:
-    """Return the difference of the mean of the inner pixels from the wanted one, in %, or NaN for a
-    black image.
+    """Return by how much the mean light of a restored image exceeds that of the reference, in %.
+
+    Only inner pixels count, without the border that `inner` leaves out.
 
     Args:
-        dn: the restored image (H, W), digital numbers.
-        reference_dn: the reference, likewise.
-        unclipped: True where pixels count, (H, W); None if all of them do.
-        offset_dn: the digital number of the dark.
+        dn: the restored image, digital numbers (H, W).
+        reference_dn: the reference image, digital numbers (H, W).
+        unclipped: True where pixels count, (H, W); None if all pixels do. If no inner pixel counts,
+            all are used.
+        offset_dn: the digital number that the sensor stores without light.
+
+    Returns:
+        100 * (mean / mean of the reference - 1), or NaN if the reference is black.
     """
     images = [inner(image) for image in (dn, reference_dn)]
     if unclipped is not None and inner(unclipped).any():
@@ -126,13 +138,13 @@ def bias_percent(
 
 @dataclass(frozen=True)
 class Instruments:
-    """The metrics and units with which images are measured.
+    """The metrics that score restored images, and the digital numbers that they assume.
 
     Attributes:
-        perceptual: distances by name besides PSNR and SSIM, each a function or the reason why it is
-            unavailable.
-        max_dn: the digital number that is full scale.
-        offset_dn: the digital number of the dark.
+        perceptual: the perceptual metrics by name, in addition to PSNR and SSIM: each a function of
+            two images, or the reason why it is unavailable.
+        max_dn: the digital number that is full scale; by default that of 12 bits.
+        offset_dn: the digital number that the sensor stores without light.
     """
 
     perceptual: Mapping[str, Perceptual | str]
@@ -140,7 +152,15 @@ class Instruments:
     offset_dn: float = 0.0
 
     def score(self, dn: np.ndarray, pair: NamedPair) -> dict[str, float | None]:
-        """Return the figures of one restored image of a pair, (H, W) digital numbers."""
+        """Compute all scores of one restored image.
+
+        Args:
+            dn: the restored image, digital numbers (H, W).
+            pair: the pair whose degraded image was restored.
+
+        Returns:
+            The scores by name, in the units that `figure` states; None if one is unavailable.
+        """
         psnr, before = (self._psnr_db(image, pair.reference, pair) for image in (dn, pair.degraded))
         clean = pair.noise_free
         scores: dict[str, float | None] = {"PSNR": psnr}
@@ -173,7 +193,17 @@ class Instruments:
         source: str,
         interval: tuple[float, float] | None = None,
     ) -> Figure:
-        """Return a score as a figure, which is unavailable with a reason if there is no value."""
+        """Convert a score to a figure with unit and source.
+
+        Args:
+            key: the name of the score.
+            value: the value of the score, or None.
+            source: what the value was measured on, in words.
+            interval: the interval of the value, or None.
+
+        Returns:
+            The figure. It is unavailable, with the reason, if the value is None or not finite.
+        """
         unit = UNITS.get(key, DISTANCE)
         if value is None:
             without_clean = key in (NOISE_FREE, INNER_NOISE_FREE)
@@ -185,8 +215,16 @@ class Instruments:
     def means(
         self, scores: Sequence[Mapping[str, float | None]], sites: Sequence[str], seed: int
     ) -> dict[str, Figure]:
-        """Return the mean of each score over the images that have it, with the bootstrap interval
-        over their sites.
+        """Average the scores of images, each with its bootstrap interval over sites.
+
+        Args:
+            scores: the scores of each image by name, as `score` returns them.
+            sites: the site of each image; images of one site resemble one another.
+            seed: the seed of the bootstrap.
+
+        Returns:
+            The mean of each score by name, over the images that have it, and the largest bias of
+            the mean.
         """
         figures = {}
         for key, first in scores[0].items():
@@ -213,7 +251,17 @@ class Instruments:
 def score(
     method: Method, pairs: Sequence[NamedPair], instruments: Instruments, seed: int
 ) -> list[Row]:
-    """Return the mean row of a method, then one row for each image."""
+    """Restore the degraded image of each pair by a method, and score the results.
+
+    Args:
+        method: the method.
+        pairs: the pairs of a degraded and a reference image.
+        instruments: the metrics.
+        seed: the seed of the bootstrap, which gives the intervals.
+
+    Returns:
+        A row of the table 'mean', then a row of the table 'images' for each pair.
+    """
     rows = []
     scores = []
     with steps(method.name, len(pairs)) as bar:
@@ -230,8 +278,13 @@ def score(
 
 
 def site_rows(rows: Sequence[Row]) -> list[Row]:
-    """Return tables by site of every score except the gain, with a row for each site and a column
-    for each method.
+    """Average the scores of single images by site, in one table for each score but the gain.
+
+    Args:
+        rows: the rows of an evaluation, of which those of the table 'images' are used.
+
+    Returns:
+        The rows of the tables 'SCORE by site': a row for each site, with a column for each method.
     """
     images = [row for row in rows if row.table == "images"]
     keys = [
@@ -275,7 +328,9 @@ PAPER = {
 
 
 def paper_rows() -> list[Row]:
-    """Return the paper's two rows as printed."""
+    """Return the scores that the ConvBEERS paper prints for its traditional pipeline and its
+    network, as two rows of the table 'mean'.
+    """
     rows = []
     for name, values in PAPER.items():
         figures: dict[str, Figure] = {}

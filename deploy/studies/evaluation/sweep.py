@@ -47,8 +47,15 @@ NOISE = ((15.0, 50.0), (25.0, 55.0), (30.0, 80.0), (70.0, 150.0), (90.0, 190.0))
 
 
 def conditions(nominal: Instrument, profile: Sensor) -> dict[str, Instrument]:
-    """Return the nominal sensor, and sensors with other MTFs (equal or different along both axes),
-    other SNRs, both, and another gain.
+    """Return the sensors under which the sweep compares methods: the nominal one, and others that
+    differ from it in MTF, SNR or gain.
+
+    Args:
+        nominal: the sensor from which the others depart.
+        profile: its profile, which states the radiances of the SNRs.
+
+    Returns:
+        The sensors by the name of the condition, such as "MTF 5%".
     """
     low = _noisy(nominal, profile, 25, 55)
     worst = _noisy(nominal, profile, 15, 50)
@@ -65,8 +72,15 @@ def conditions(nominal: Instrument, profile: Sensor) -> dict[str, Instrument]:
 
 
 def suppositions(nominal: Instrument, profile: Sensor) -> dict[str, dict[str, Instrument]]:
-    """Return wrongly known sensors: for the name of each true condition, the sensors that are
-    assumed instead.
+    """Return the sensors that methods assume wrongly in the sweep.
+
+    Args:
+        nominal: the sensor from which the conditions depart.
+        profile: its profile, which states the radiances of the SNRs.
+
+    Returns:
+        By the name of the true condition (of the sensor that acquires the images), the sensors that
+        are assumed instead, by their names.
     """
     mtf = {value: {f"MTF {value:.0%}": _sharp(nominal, value)} for value in (0.05, 0.07, 0.10)}
     # SNR is radiance over sigma: with k times as much of it, the variance is k^2 times smaller.
@@ -101,18 +115,18 @@ def run_sweep(
     seed: int,
     brightness: float = 1.0,
 ) -> "SweepResult":
-    """Run the input, the pipeline and every network under every condition, on one scene of each
-    site.
+    """Compare the degraded input, the traditional pipeline and networks under sensors of other
+    blur, noise and gain, on one scene of each site.
 
     Args:
-        methods: the methods, of which the networks are run. Each condition's sensor is given to
-            those that can use it.
-        images: folder of the scenes; drawn ones if None.
+        methods: the methods of the evaluation, of which the networks are used. Each condition's
+            sensor is given to those that can use it.
+        images: the folder of scenes; None draws scenes.
         profile: the profile of the sensor from which the conditions depart.
-        reference: profile of the sensor that is aimed at.
+        reference: the profile of the sensor that the restoration aims at.
         seed: the seed of every random draw.
-        brightness: factor of the scenes' radiance. The MTF is measured only at 1, because edges do
-            not depend on it.
+        brightness: the factor by which the radiance of the scenes is multiplied. The MTF is
+            measured only at 1, because edges do not depend on it.
     """
     psnr = dict[Key, np.ndarray]()
     mtf = dict[Key, Figure]()
@@ -181,16 +195,19 @@ Key = tuple[str, str, str]
 
 @dataclass(frozen=True)
 class SweepResult:
-    """The measurements of a sweep, trial by trial.
+    """The measurements of a sweep over N images.
+
+    A trial is one method on the images of one sensor. Its key has three names: of the condition
+    (the sensor that acquired the images), of the sensor that the method assumes, and of the method.
 
     Attributes:
-        psnr: in dB, (2, N): each image against the reference, and against the reference without
-            noise.
-        mtf: after restoration, with the true sensor known, and for the pipeline that assumes the
-            nominal one.
+        psnr: for each trial the PSNR in dB, (2, N): of each image against the reference, and
+            against the reference without noise.
+        mtf: for each trial the MTF at Nyquist of restored edges in %, if the method assumes the
+            true sensor or the nominal one; empty if `brightness` is not 1.
         sites: the sites of the images, (N,).
-        seed: the seed of the bootstrap.
-        brightness: factor of the scenes' radiance.
+        seed: the seed of the bootstrap over sites, which gives the intervals.
+        brightness: the factor by which the radiance of the scenes was multiplied.
     """
 
     psnr: Mapping[Key, np.ndarray]
@@ -201,21 +218,24 @@ class SweepResult:
 
     @property
     def conditions(self) -> list[str]:
-        """The names of the sensors that acquired the scenes."""
+        """The names of the conditions, the sensors that acquired the images, in order."""
         return list(dict.fromkeys(truth for truth, _, _ in self.psnr))
 
     @property
     def networks(self) -> list[str]:
-        """The names of the methods that are neither the input nor the pipeline."""
+        """The names of the methods that are neither the degraded input nor the traditional
+        pipeline.
+        """
         names = dict.fromkeys(name for *_, name in self.psnr)
         return [name for name in names if name not in (DEGRADED, TRADITIONAL)]
 
     @property
     def rows(self) -> list[Row]:
-        """Every table, with a row for each condition, and for the gains also a row for each network
-        over all conditions.
+        """The rows of all tables of the sweep: PSNR, MTF, the gain over the traditional pipeline,
+        and the loss by a wrongly assumed sensor.
 
-        The MTF does not depend on the scenes, so it is left out if their brightness is changed.
+        Each table has a row for each condition. The gains have a second table with a row for each
+        network over all conditions. The MTF is left out if the brightness is not 1.
         """
         names = ("sweep, PSNR", f"sweep, {NOISE_FREE}")
         tables: list[tuple[str, Mapping[Key, Figure]]] = [

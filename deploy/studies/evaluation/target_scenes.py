@@ -59,12 +59,14 @@ Edges = Sequence[tuple[float, np.ndarray]]
 
 @dataclass(frozen=True)
 class Points:
-    """Points of light on a flat background: the same noise with and without them.
+    """An image of points of light on a flat background, with which the light of points after
+    restoration is measured.
 
     Attributes:
-        background: radiance in W/m2/sr/um.
+        background: the radiance of the background in W/m2/sr/um.
         acquired: the image that the degraded sensor acquires, (H, W) digital numbers.
-        flat: the same without points, acquired with the same random draws.
+        flat: the image of the background without points, (H, W) digital numbers, with the same
+            noise.
         expected: the light of the points alone as the reference sensor sees it without noise,
             (H, W) digital numbers.
     """
@@ -77,13 +79,14 @@ class Points:
 
 @dataclass(frozen=True)
 class Pattern:
-    """Bars or a zone plate.
+    """An image of faint bars or of a zone plate, with which the transfer of contrast is measured.
 
     Attributes:
-        name: the name of the figure.
+        name: the name of the figure, which states kind, contrast and period.
         acquired: the image that the degraded sensor acquires, (H, W) digital numbers.
-        expected: the image that the reference sensor acquires without noise, likewise.
-        measured: True where the restored image is compared, (H, W).
+        expected: the image that the reference sensor acquires without noise, (H, W) digital
+            numbers.
+        measured: True where the restored image is compared with `expected`, bool (H, W).
     """
 
     name: str
@@ -94,14 +97,15 @@ class Pattern:
 
 @dataclass(frozen=True)
 class Targets:
-    """Acquired targets, (H, W) digital numbers.
+    """The images of all targets, scenes whose truth is known, as one sensor acquires them.
 
     Attributes:
-        sensor: the sensor that acquired them.
-        edges: slanted edges, each with independent noise.
-        flats: radiance in W/m2/sr/um, and the flat field.
-        points: points of light, one image for each background.
-        patterns: bars and zone plates; several of one name are measured together.
+        sensor: the sensor that acquired the images.
+        edges: the angle in degrees and the image (H, W) of each slanted edge, each with independent
+            noise.
+        flats: the radiance in W/m2/sr/um and the image (H, W) of each flat field.
+        points: the images of points of light, one for each background.
+        patterns: the images of bars and zone plates. Several of one name are measured together.
     """
 
     sensor: Instrument
@@ -112,12 +116,13 @@ class Targets:
 
 
 def acquire_targets(sensor: Instrument, reference: Instrument, seed: int) -> Targets:
-    """Acquire all targets.
+    """Simulate how a sensor acquires all targets: edges, flat fields, points, bars, zone plates.
 
     Args:
         sensor: the sensor of the degraded images.
-        reference: the sensor that is aimed at.
-        seed: seed of the noise and of the places of the points within their pixels.
+        reference: the sensor that the restoration aims at, whose images without noise are the
+            truth.
+        seed: the seed of the noise and of the places of the points within their pixels.
     """
     sensors = sensor, reference.in_units_of(sensor)
     # The first numbers are those of the edges, which draw their own noise (`acquire_edges`).
@@ -153,7 +158,15 @@ def _without_noise(scene: np.ndarray, sensor: Instrument, draw: Draw) -> np.ndar
 
 
 def acquire_edges(sensor: Instrument, seed: int) -> Edges:
-    """Acquire edges at several angles, each with independent noise."""
+    """Simulate how a sensor acquires slanted edges at several angles, each with independent noise.
+
+    Args:
+        sensor: the sensor.
+        seed: the seed of the noise.
+
+    Returns:
+        The angle in degrees and the image, digital numbers (H, W), of each edge.
+    """
     edges = []
     for number, angle in enumerate(ANGLES_DEG * REPEATS):
         scene = slanted_edge(SIDE_PX, OVERSAMPLING, angle)
@@ -178,12 +191,14 @@ def _acquire_points(
 
 
 def point_places() -> list[tuple[int, int]]:
-    """Return row and column of each point."""
+    """Return row and column of each point in the grid of `POINTS_A_SIDE` points a side."""
     return [divmod(number, POINTS_A_SIDE) for number in range(POINTS_A_SIDE**2)]
 
 
 def point_radiance(row: int, column: int) -> float:
-    """Return the light of the point in a row and column, W/m2/sr/um."""
+    """Return the light of the point at a row and column of the grid of points: its contribution to
+    the mean radiance of one pixel, in W/m2/sr/um.
+    """
     return POINT_RADIANCES[(row + column) % len(POINT_RADIANCES)]
 
 

@@ -51,8 +51,14 @@ OF_REFERENCE = "of the reference"
 
 
 def mean_figures(method: Method, targets: Targets) -> dict[str, Figure]:
-    """Return MTF at Nyquist in % and SNR in flat fields of the restored targets, for the table of
-    means.
+    """Restore edges and flat fields by a method, and measure the MTF and the SNR of the results.
+
+    Args:
+        method: the method.
+        targets: the acquired targets.
+
+    Returns:
+        The MTF at Nyquist in % and the SNR at each radiance, by name, for the table of means.
     """
     figures = {"MTF at Nyquist": restored_mtf(method, targets.edges, targets.sensor.max_dn)}
     for radiance, flat in targets.flats:
@@ -63,8 +69,16 @@ def mean_figures(method: Method, targets: Targets) -> dict[str, Figure]:
 
 
 def target_row(method: Method, targets: Targets) -> Row:
-    """Return the row of a method in the table of targets: flux of points, and contrast transfer of
-    patterns.
+    """Restore points and faint patterns by a method, and measure how much light and contrast is
+    left.
+
+    Args:
+        method: the method.
+        targets: the acquired targets.
+
+    Returns:
+        The row of the method in the table of targets: the flux of points in %, and the contrast of
+        patterns relative to the reference.
     """
     figures: dict[str, Figure] = {}
     for points in targets.points:
@@ -76,7 +90,9 @@ def target_row(method: Method, targets: Targets) -> Row:
 
 
 def interval_of_mean(values: Sequence[float]) -> tuple[float, float]:
-    """Return the 90 % interval of the mean of two or more independent values (Student's t)."""
+    """Return the lower and upper end of the 90 % interval of the mean of two or more independent
+    values, by Student's t distribution.
+    """
     mean = float(np.mean(values))
     reach = (
         float(stdtrit(len(values) - 1, 0.95)) * float(np.std(values, ddof=1)) / len(values) ** 0.5
@@ -85,7 +101,13 @@ def interval_of_mean(values: Sequence[float]) -> tuple[float, float]:
 
 
 def restored_mtf(method: Method, edges: Edges, max_dn: int) -> Figure:
-    """Return the MTF at Nyquist in % of the edges that the method restored."""
+    """Restore slanted edges by a method, and measure the MTF at Nyquist of the results in %.
+
+    Args:
+        method: the method.
+        edges: angle in degrees and image, digital numbers (H, W), of each edge.
+        max_dn: the largest digital number, at which pixels clip.
+    """
     return mtf_figure(
         [edge_mtf(_middle(method.restore(edge)), angle, max_dn) for angle, edge in edges]
     )
@@ -97,8 +119,14 @@ def _middle(image: np.ndarray) -> np.ndarray:
 
 
 def mtf_figure(edges: Sequence[float | Refusal]) -> Figure:
-    """Return the mean over the edges with its 90 % interval; unavailable if most edges were
-    refused.
+    """Average the MTF at Nyquist over edges.
+
+    Args:
+        edges: the MTF of each edge as a share, or the reason why it could not be measured.
+
+    Returns:
+        The mean in % with its 90 % interval. It is unavailable if fewer than two edges, or fewer
+        than half of them, were measured.
     """
     values = [100 * edge for edge in edges if not isinstance(edge, Refusal)]
     refusals = [edge for edge in edges if isinstance(edge, Refusal)]
@@ -111,12 +139,23 @@ def mtf_figure(edges: Sequence[float | Refusal]) -> Figure:
 
 
 def snr_name(radiance: float) -> str:
-    """Return the name of the SNR in a flat field of a radiance in W/m2/sr/um."""
+    """Return the name of the figure of the SNR in a flat field.
+
+    Args:
+        radiance: the radiance of the field in W/m2/sr/um.
+    """
     return f"SNR at {radiance:g} W/m2/sr/um"
 
 
 def flat_figure(flat: np.ndarray) -> Figure:
-    """Return the linear SNR of a flat field (h, w): its mean over its standard deviation."""
+    """Return the SNR of a flat field as a ratio: its mean over its standard deviation.
+
+    Args:
+        flat: digital numbers (h, w) of a restored flat field, minus those of the dark.
+
+    Returns:
+        The figure. It is unavailable if a denoiser left no noise.
+    """
     mean = float(flat.mean(dtype=np.float64))
     deviation = float(flat.std(dtype=np.float64, ddof=1))
     # A denoiser may leave a field flat, and its SNR would be infinite.
@@ -128,16 +167,28 @@ def flat_figure(flat: np.ndarray) -> Figure:
 
 
 def flux_name(radiance: float, background: float) -> str:
-    """Return the name of the flux of points of a radiance on a background, both in W/m2/sr/um."""
+    """Return the name of the figure of the flux of points.
+
+    Args:
+        radiance: the light of a point, in W/m2/sr/um over one pixel.
+        background: the radiance of the background, in W/m2/sr/um.
+    """
     return f"flux of points of {radiance:g} on {background:g} W/m2/sr/um"
 
 
 def flux_figures(method: Method, points: Points) -> dict[str, Figure]:
-    """Return the flux in % of the points of each radiance.
+    """Restore points of light by a method, and measure the flux: the light of a point in the result
+    over its light in the image that the reference sensor acquires without noise.
 
-    The background is the result of the method for the same flat field with the same random draws.
-    Its noise is nearly the same at each pixel, so the difference is much more accurate than one
-    with a ring around the point would be.
+    The result for the same background without points, with the same noise, is subtracted first. The
+    difference is much more accurate than one with a ring around the point would be.
+
+    Args:
+        method: the method.
+        points: the acquired image of points on one background.
+
+    Returns:
+        The mean flux in % for each light of a point, by name, with its 90 % interval.
     """
     light = method.restore(points.acquired).astype(np.float64) - method.restore(points.flat)
     values: dict[float, list[float]] = {radiance: [] for radiance in POINT_RADIANCES}
@@ -162,8 +213,16 @@ def _aperture(number: int) -> slice:
 
 
 def transfer_figure(method: Method, patterns: Sequence[Pattern]) -> Figure:
-    """Return the mean contrast transfer over the quarters of each pattern, with
-    its 90 % interval.
+    """Restore faint patterns by a method, and measure the contrast transfer: the contrast in the
+    result relative to that in the image that the reference sensor acquires without noise.
+
+    Args:
+        method: the method.
+        patterns: the acquired patterns of one name.
+
+    Returns:
+        The mean over the quarters of all patterns, with its 90 % interval; 1 is the contrast of the
+        reference.
     """
     values: list[float] = []
     for pattern in patterns:

@@ -21,8 +21,14 @@ from beers_deploy.studies.stress.networks import STAGES, Subject
 
 @dataclass(frozen=True)
 class StageResult:
-    """One case at one stage: the worst value of each check over its images, or the reason why it
-    was not checked.
+    """The result of one hard case at one stage, one way of running the networks.
+
+    Attributes:
+        case: the hard case, a kind of images.
+        stage: the name of the stage, one of `STAGES`.
+        measures: the worst value of each check over the images of the case; empty if nothing was
+            checked.
+        reason: the reason why the stage could not be checked; empty if it could.
     """
 
     case: Case
@@ -33,7 +39,7 @@ class StageResult:
     @property
     def broken(self) -> list[tuple[Measure, Limitation | None]]:
         """The measures that exceed their bounds, each with the known limitation that explains it,
-        or None.
+        or with None if it is a failure.
         """
         return [
             (m, limitation_of(self.stage, self.case.name, m)) for m in self.measures if not m.holds
@@ -41,7 +47,7 @@ class StageResult:
 
     @property
     def limitations(self) -> list[Limitation]:
-        """The known limitations that were reached."""
+        """The known limitations that explain measures outside their bounds, each once."""
         return list(dict.fromkeys(limit for _, limit in self.broken if limit is not None))
 
     @property
@@ -51,7 +57,9 @@ class StageResult:
 
     @property
     def verdict(self) -> str:
-        """The verdict in a few words."""
+        """The result in a few words, as tables show it: ok, a limitation, FAILED, or - if nothing
+        was checked.
+        """
         if self.failed:
             return "FAILED: " + ", ".join(measure.check for measure in self.failed)
         if self.limitations:
@@ -66,14 +74,18 @@ def run_battery(
     seed: int = 0,
     side_px: int = SIDE_PX,
 ) -> list[StageResult]:
-    """Check every case at every stage.
+    """Draw the images of every hard case, and check the networks on them at every stage.
 
     Args:
-        subject: the networks.
-        cases: the hard cases that they restore.
-        stages: names of STAGES.
+        subject: the networks under test.
+        cases: the hard cases.
+        stages: the names of the stages, from `STAGES`.
         seed: the seed of the images.
-        side_px: the side of images whose case has no size of its own.
+        side_px: the side in pixels of images whose case states no size.
+
+    Returns:
+        A result for each case at each stage, case by case. Failures are part of the results; they
+        raise no error.
     """
     results = []
     reasons = {stage: _obstacle(subject, stage) for stage in stages}
@@ -116,7 +128,9 @@ def _measures(
 
 
 def worst(measures: Iterable[Measure]) -> list[Measure]:
-    """Return the measure of each check that exceeds its bound most. NaN counts as the worst."""
+    """Return for each check, of all its measures, the one that exceeds its bound most. NaN counts
+    as the worst.
+    """
     by_check: dict[str, list[Measure]] = {}
     for measure in measures:
         by_check.setdefault(measure.check, []).append(measure)
@@ -128,7 +142,12 @@ def _excess(measure: Measure) -> float:
 
 
 def chosen(names: str | Sequence[str] | None, available: Iterable[str], option: str) -> list[str]:
-    """Return the names of a list, or of text with commas; all that are available if None.
+    """Return the names that a user chooses from the available ones.
+
+    Args:
+        names: a list of names, or a text of names separated by commas; None chooses all.
+        available: the names that may be chosen.
+        option: the name of the option, for messages.
 
     Raises:
         OptionError: a name is not available.
@@ -165,10 +184,18 @@ LEGEND = (
 def battery_table(
     subject: Subject, cases: Sequence[Case], stages: Sequence[str], seed: int, side_px: int
 ) -> Table:
-    """Run the battery, and return its tables and its verdict.
+    """Check the networks on every hard case, and return the results as `stress` reports them.
 
     The tables are a row for each case, the worst value of each check, the known limitations that
-    were reached, the integer layers, and in detail every figure of every case at every stage.
+    were reached, the integer layers, and in detail every figure of every case at every stage. The
+    checks of the table fail if a case fails or a sum of integers might overflow.
+
+    Args:
+        subject: the networks under test.
+        cases: the hard cases.
+        stages: the names of the stages, from `STAGES`.
+        seed: the seed of the images.
+        side_px: the side in pixels of images whose case states no size.
     """
     results = run_battery(subject, cases, stages, seed, side_px)
     layers = layer_rows(subject)
@@ -208,7 +235,7 @@ def battery_table(
 
 
 def battery_rows(results: Iterable[StageResult]) -> list[Row]:
-    """Return a row for each case, with a word for each stage."""
+    """Return a row for each hard case, with the verdict in words for each stage."""
     verdicts: dict[str, dict[str, str]] = {}
     for result in results:
         verdicts.setdefault(result.case.name, {})[result.stage] = result.verdict
@@ -216,7 +243,9 @@ def battery_rows(results: Iterable[StageResult]) -> list[Row]:
 
 
 def worst_rows(results: Iterable[StageResult]) -> list[Row]:
-    """Return a row for each check of each stage: its worst value over all cases."""
+    """Return a row for each check of each stage: its worst value over all cases, the bound, and the
+    case.
+    """
     by_name: dict[str, list[tuple[Measure, str]]] = {}
     for result in results:
         for measure in result.measures:
@@ -236,7 +265,9 @@ def worst_rows(results: Iterable[StageResult]) -> list[Row]:
 
 
 def limitation_rows(results: Iterable[StageResult]) -> list[Row]:
-    """Return a row for each known limitation that was reached, with its largest value."""
+    """Return a row for each known limitation that explains a measure outside its bound, with the
+    largest such measure, the case, and its meaning for a user.
+    """
     largest: dict[str, tuple[Measure, Limitation, str]] = {}
     for result in results:
         for measure, limit in result.broken:
@@ -253,7 +284,7 @@ def limitation_rows(results: Iterable[StageResult]) -> list[Row]:
 
 
 def finding_rows(results: Iterable[StageResult]) -> list[Row]:
-    """Return every figure of every case at every stage, for the document."""
+    """Return a row for each case at each stage with all its figures, for the JSON document."""
     rows = []
     for result in results:
         figures = {measure.check: _figure(measure) for measure in result.measures}
@@ -267,8 +298,10 @@ def _figure(measure: Measure) -> Figure:
 
 
 def layer_rows(subject: Subject) -> list[Row]:
-    """Return for each integer layer the maximum number of bits that its accumulator needs, and
-    whether it might saturate.
+    """Return a row for each integer layer of the INT8 network: the number of bits that its
+    accumulator needs at most, and in words if it might overflow int32 or saturate int8.
+
+    The rows hold for every image, by interval arithmetic. There are none without an integer core.
     """
     if _obstacle(subject, "INT8 reference"):
         return []

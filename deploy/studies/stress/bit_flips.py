@@ -51,13 +51,18 @@ GUARD_NOTE = (
 
 
 def flip_table(subject: Subject, source: Calibration, board: TargetProfile) -> Table:
-    """Return quality against flips, and the cost of guards.
+    """Measure the loss of quality by bit flips, and predict the cost of guards against them, as
+    `stress --bit-flips` reports both.
 
     Args:
-        subject: with an INT8 network.
-        source: the source of the patches that flips are tried on, one for each injection into each
-            kind of memory at each rate.
+        subject: the networks under test, of which the INT8 one is used.
+        source: the simulated patches on which flips are tried. Their number is also the number of
+            injections into each kind of memory at each rate.
         board: the board whose cost model predicts the cost of the guards.
+
+    Raises:
+        ModelError: there is no INT8 network, or it has no integer core as the board stores it.
+        BeersError: the board states no constants for the prediction.
     """
     # A file without an integer core is refused before anything is drawn.
     _ = subject.core
@@ -78,14 +83,14 @@ def flip_table(subject: Subject, source: Calibration, board: TargetProfile) -> T
 
 @dataclass(frozen=True)
 class FaultTarget:
-    """A network prepared for fault injection.
+    """A network prepared for the injection of bit flips, and the patches on which they are tried.
 
     Attributes:
-        core: the network as the board stores it.
-        guards: learnt from calibration patches.
-        pairs: the patches on which flips are tried, degraded and reference, (1, 1, H, W) in [0, 1]
-            each.
-        checks: the self-check for the sensor of each patch.
+        core: the integer operations of the network, with weights as the board stores them.
+        guards: the bounds and checksums that protect the network, learnt from calibration patches.
+        pairs: the degraded and the reference image of each patch, (1, 1, H, W) in [0, 1] each.
+        checks: for each patch the self-check of its sensor, which compares the restored patch,
+            blurred as the sensor blurs, with the degraded one.
     """
 
     core: IntCore
@@ -95,13 +100,17 @@ class FaultTarget:
 
 
 def make_target(subject: Subject, source: Calibration) -> FaultTarget:
-    """Prepare a network for fault injection: its stored integers, guards, patches and self-checks.
+    """Prepare a network for the injection of bit flips: stored integers, guards, patches and
+    self-checks.
 
     Args:
-        subject: the subject of the study, with an INT8 network.
-        source: where calibration patches come from. The guards are learnt from them. Flips are
-            tried on patches of another seed, so that the guards are not evaluated on their training
-            data.
+        subject: the networks under test, of which the INT8 one is used.
+        source: the simulated patches. The guards are learnt from patches of this seed, and flips
+            are tried on patches of another seed, so that the guards are not evaluated on the data
+            that they were learnt from.
+
+    Raises:
+        ModelError: there is no INT8 network, or it has no integer core as the board stores it.
     """
     core = faults.as_stored(subject.core)
     calibration = replace(source, patches=CALIBRATION_PATCHES)
@@ -119,7 +128,12 @@ SETS = ("no guard", "clamped", "all guards")
 
 
 def name_of(memory: str, rate: float) -> str:
-    """Return the name of the row for a kind of memory and a rate in flips a megabit."""
+    """Return the name of the row of results for a kind of memory and a rate.
+
+    Args:
+        memory: the kind of memory, one of `faults.MEMORIES`.
+        rate: the mean number of bit flips in a megabit of 10^6 bits.
+    """
     return f"{memory}, {rate:g} in a megabit"
 
 
@@ -131,13 +145,14 @@ COSTLY_DB = 0.5
 
 @dataclass(frozen=True)
 class Injection:
-    """The effect of one injection on a patch.
+    """The effect of the bit flips of one injection on one patch.
 
     Attributes:
-        flips: the number of bits.
-        quality: PSNR with each set of guards, in dB.
-        costly: True if it cost more than COSTLY_DB without a guard, and some block is decidable.
-        detected: True if the self-check finds a block outside its bound, without a guard.
+        flips: the number of flipped bits.
+        quality: the PSNR in dB of the restored patch with each of the `SETS` of guards.
+        costly: True if the flips cost more than COSTLY_DB without a guard, and the self-check could
+            show it, because the patch has blocks that are not too smooth.
+        detected: True if the self-check finds that the unguarded result contradicts the patch.
     """
 
     flips: int
@@ -147,16 +162,18 @@ class Injection:
 
 
 def curve_rows(target: FaultTarget, draws: int, seed: int) -> list[Row]:
-    """Return a row without flips, and one for every kind of memory and rate.
+    """Measure the PSNR of restored patches without bit flips, and with flips in each kind of memory
+    at each rate.
 
     Args:
         target: the network, its guards and the patches.
-        draws: injections for each kind of memory and rate; kinds that are seldom hit get a
-            multiple.
+        draws: the number of injections for each kind of memory and rate. Kinds that are seldom hit
+            get a multiple of it.
         seed: the seed of the flips.
 
     Returns:
-        Rows of the table "bit flips", with the PSNR in dB for each set of guards.
+        The rows of the table "bit flips": for each set of guards the mean PSNR in dB and its range,
+        and the share of costly injections that the self-check found.
     """
     clean = []
     for image, reference in target.pairs:
@@ -185,8 +202,8 @@ def _quality_db(
 
     Args:
         injected: the network and the patch after an injection.
-        guards: the clamps that are in use; None for none.
-        reference: (1, 1, H, W) in [0, 1].
+        guards: the bounds that are applied; None applies none.
+        reference: the reference image of the patch, (1, 1, H, W) in [0, 1].
     """
     return psnr_db(faults.restored(injected, guards), reference, 1.0)
 
@@ -270,13 +287,16 @@ INSTRUCTIONS = 2
 
 
 def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Row]:
-    """Return the predicted cost of each guard and of all of them, for every tile of 640 x 640
-    pixels.
+    """Predict the cost of each guard against bit flips, and of all of them, on a board.
 
     Args:
         target: the network and its guards.
-        prediction: the time of the network on the board.
-        dpu: the board, whose profile states clock and cores of the host.
+        prediction: the time that the cost model predicts for the network on the board.
+        dpu: the DPU of the board, whose profile also states the clock and cores of the host.
+
+    Returns:
+        The rows of the table "guards": the time for each tile of 640 x 640 pixels, its share of the
+        tile's time, and the loss of frame rate.
     """
     relus = sum(op.activation is Activation.relu for op in target.core.convolutions)
     # The rate is fitted for one core.
@@ -320,14 +340,14 @@ def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Ro
 
 
 def flip_curves_svg(networks: Mapping[str, Sequence[Row]]) -> str:
-    """Return a plot of PSNR against bit flips, with all guards and, dashed, with none.
+    """Draw PSNR against the rate of bit flips, with all guards and, dashed, with none.
 
     Args:
-        networks: the rows of each network by its name. Only those of the table "bit flips" are
-            drawn.
+        networks: the rows that `curve_rows` returns for each network, by the name of the network.
+            Rows of other tables are left out.
 
     Returns:
-        An SVG with a panel for each kind of memory.
+        The text of an SVG file with a panel for each kind of memory.
     """
     rows_of = {
         name: {row.name: row.figures for row in rows if row.table == "bit flips"}

@@ -22,7 +22,11 @@ Draw = Callable[[int, np.random.Generator], list[np.ndarray]]
 
 
 def flat(*levels: float) -> Draw:
-    """Return a function that draws constant images (side, side) at these shares of full scale."""
+    """Return a function that draws constant images (side, side), one for each level.
+
+    Args:
+        levels: the brightness of each image as a share of full scale.
+    """
     return lambda side, _: [_filled(side, level * FULL_DN) for level in levels]
 
 
@@ -54,7 +58,7 @@ def hot_pixel(side: int, _: np.random.Generator) -> list[np.ndarray]:
 
 
 def dead_lines(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """Draw a ground with a column and a row at 0: one image (side, side)."""
+    """Draw a landscape (`ground`) with a column and a row at 0: one image (side, side)."""
     image = ground(side, generator)
     image[:, side // 3] = 0
     image[side // 2] = 0
@@ -99,18 +103,22 @@ def star(side: int, _: np.random.Generator) -> list[np.ndarray]:
 
 
 def noisy(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """Draw a ground at a signal-to-noise ratio of 3: one image (side, side)."""
+    """Draw a landscape (`ground`) at a signal-to-noise ratio of 3: one image (side, side)."""
     clean = ground(side, generator)
     return [_digital(clean * (1 + generator.standard_normal(clean.shape) / 3))]
 
 
 def through(mtf_nyquist: float) -> Draw:
-    """Return a function that draws a ground with the given MTF at Nyquist, without noise."""
+    """Return a function that draws one image (side, side): a landscape (`ground`) seen through an
+    instrument with the given MTF at Nyquist (a share), without noise.
+    """
     return lambda side, generator: [ground(side, generator, mtf_nyquist)]
 
 
 def stripes(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """Draw a ground that lacks every seventh column and one row (NaN): one image (side, side)."""
+    """Draw a landscape (`ground`) that lacks every seventh column and one row (NaN): one image
+    (side, side).
+    """
     image = ground(side, generator)
     image[:, 3::7] = np.nan
     image[side // 4] = np.nan
@@ -118,7 +126,9 @@ def stripes(side: int, generator: np.random.Generator) -> list[np.ndarray]:
 
 
 def scattered(value: float) -> Draw:
-    """Return a function that draws a ground in which 2 % of the pixels have this value."""
+    """Return a function that draws one image (side, side): a landscape (`ground`) in which 2 % of
+    the pixels have the given value.
+    """
 
     def draw(side: int, generator: np.random.Generator) -> list[np.ndarray]:
         image = ground(side, generator)
@@ -129,8 +139,8 @@ def scattered(value: float) -> Draw:
 
 
 def sized(*shapes: tuple[int, int]) -> Draw:
-    """Return a function that cuts parts of these shapes from one drawn ground, independent of the
-    side.
+    """Return a function that cuts images of the given shapes (H, W) from one drawn landscape
+    (`ground`). The side that it is called with has no effect.
     """
 
     def draw(_: int, generator: np.random.Generator) -> list[np.ndarray]:
@@ -141,14 +151,21 @@ def sized(*shapes: tuple[int, int]) -> Draw:
 
 
 def narrow(_: int, __: np.random.Generator) -> list[np.ndarray]:
-    """Return a row (1, 97) and a column (97, 1) at half of full scale."""
+    """Draw an image of one row, (1, 97), and one of one column, (97, 1), at half of full scale."""
     row = np.full((1, 97), FULL_DN // 2, np.float32)
     return [row, row.T.copy()]
 
 
 def ground(side: int, generator: np.random.Generator, mtf_nyquist: float = DRAWN_MTF) -> np.ndarray:
-    """Draw rectangles of all sizes and brightnesses, seen through an MTF: (side, side), integers of
-    0 to 4095.
+    """Draw a landscape of rectangles of all sizes and brightnesses, as an instrument sees it.
+
+    Args:
+        side: the side of the image in pixels.
+        generator: draws the rectangles.
+        mtf_nyquist: the instrument's MTF at Nyquist, a share; by default that of a sharp one.
+
+    Returns:
+        An image (side, side) of integers of 0 to 4095, float32, without noise.
     """
     image = _filled(side, generator.uniform(800, 1600))
     for _ in range(40):
@@ -173,14 +190,16 @@ def _digital(image: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Case:
-    """One kind of hard image.
+    """A hard case: a kind of image that is difficult for a network.
 
     Attributes:
-        name: short, as in the tables.
-        draw: draws its images.
-        pixels: "sound", or the fault of the pixels: "missing" (NaN), "infinite", "beyond" 12 bits.
-        flat: True if every pixel of an image is the same, so that the mean must be preserved.
-        large: True if only the checks of one run are made.
+        name: the short name in tables.
+        draw: the function that draws the images of the case, given a side in pixels and a random
+            generator.
+        pixels: "sound" if all pixels are valid, or the fault of some: "missing" (NaN), "infinite",
+            or "beyond" 12 bits.
+        flat: True if all pixels of an image are equal, so that the mean must be preserved.
+        large: True if the image is so large that only the checks of a single run are made.
     """
 
     name: str

@@ -23,7 +23,14 @@ Work = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Measure:
-    """One figure of one image. It holds if it is at most the allowed value. NaN never holds."""
+    """The value that a check measured on one image, and the bound that it must not exceed.
+
+    Attributes:
+        check: the name of the check.
+        value: the measured value. NaN exceeds every bound.
+        allowed: the largest value that is allowed.
+        unit: the unit of both values.
+    """
 
     check: str
     value: float
@@ -47,18 +54,26 @@ def out_of_range(image: np.ndarray) -> Measure:
 
 
 def differing(check: str, image: np.ndarray, other: np.ndarray) -> Measure:
-    """Count the pixels of two images (H, W) that differ in any bit. NaN equals NaN."""
+    """Count the pixels of two images (H, W) that differ in any bit, as the check named `check`. NaN
+    equals NaN.
+    """
     # NaN differs from itself, and a missing pixel is the same in both.
     same = (image == other) | (np.isnan(image) & np.isnan(other))
     return Measure(check, float((~same).sum()), 0, "px")
 
 
 def ringing(image: np.ndarray, source: np.ndarray, radius_px: int, allowed: float) -> Measure:
-    """Measure how far pixels (H, W) leave the range of the source's pixels within the radius,
+    """Measure ringing: how far restored pixels leave the range of the raw pixels around them,
     relative to the contrast there.
 
     One per cent of full scale does not count. The contrast is taken as at least ten per cent,
     because flat ground has none.
+
+    Args:
+        image: the restored image (H, W) in DN.
+        source: the raw image (H, W) in DN.
+        radius_px: the distance along both axes within which raw pixels count.
+        allowed: the largest ringing that is allowed, in % of the contrast.
     """
     low, high = local_range(source, radius_px)
     # Rounding and noise leave the range by a little on any ground.
@@ -68,8 +83,16 @@ def ringing(image: np.ndarray, source: np.ndarray, radius_px: int, allowed: floa
 
 
 def local_range(image: np.ndarray, radius_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the smallest and the largest pixel (H, W) within the radius along both axes. The
-    window is cut at the image's border.
+    """Return, for every pixel of an image (H, W), the smallest and the largest pixel in the square
+    around it.
+
+    Args:
+        image: the image (H, W).
+        radius_px: the distance from a pixel to the sides of its square, which is cut at the image's
+            border.
+
+    Returns:
+        The smallest and the largest pixels, two images (H, W).
     """
     square = np.ones((2 * radius_px + 1, 2 * radius_px + 1))
     return erosion(image, square), dilation(image, square)
@@ -78,8 +101,18 @@ def local_range(image: np.ndarray, radius_px: int) -> tuple[np.ndarray, np.ndarr
 def gain(
     work: Work, source: np.ndarray, result: np.ndarray, generator: np.random.Generator
 ) -> float:
-    """Return the largest change of a pixel (H, W), in DN, for a change of 1 DN: of one pixel, and
-    of all pixels with random signs.
+    """Measure how strongly a restoration amplifies small changes of its input.
+
+    Two changes of 1 DN are tried: of the pixel in the middle, and of all pixels with random signs.
+
+    Args:
+        work: the restoration, a function from an image (H, W) in DN to another.
+        source: the raw image (H, W) in DN.
+        result: the restored image, `work(source)`.
+        generator: draws the signs.
+
+    Returns:
+        The largest change of any restored pixel in DN.
     """
     one = np.zeros(source.shape, np.float32)
     one[source.shape[0] // 2, source.shape[1] // 2] = 1
@@ -88,7 +121,18 @@ def gain(
 
 
 def change(work: Work, source: np.ndarray, result: np.ndarray, nudge: np.ndarray) -> float:
-    """Return the largest change of any pixel (H, W), in DN, for a nudge (H, W) of -1, 0 or 1 DN."""
+    """Measure how much a restoration changes if its input does.
+
+    Args:
+        work: the restoration, a function from an image (H, W) in DN to another.
+        source: the raw image (H, W) in DN.
+        result: the restored image, `work(source)`.
+        nudge: the change of each raw pixel, -1, 0 or 1 DN, (H, W). Its sign is reversed where the
+            pixel would leave 0 to 4095.
+
+    Returns:
+        The largest change of any restored pixel in DN.
+    """
     target = source + nudge
     # Reverse the nudge where it would leave the converter's range.
     nudged = np.where((target < 0) | (target > FULL_DN), source - nudge, target)
@@ -96,7 +140,11 @@ def change(work: Work, source: np.ndarray, result: np.ndarray, nudge: np.ndarray
 
 
 def refused(work: Callable[[], object]) -> Measure:
-    """Count 1 if the work succeeded although an error of one sentence was expected, else 0."""
+    """Check that some work is refused with a BeersError: the measure is 0 if it is, else 1.
+
+    Args:
+        work: restores an image with invalid pixels.
+    """
     try:
         work()
     except BeersError:
@@ -105,8 +153,8 @@ def refused(work: Callable[[], object]) -> Measure:
 
 
 def inside(image: np.ndarray, margin_px: int) -> np.ndarray:
-    """Return an image (H, W) without a margin on each side, or the whole image if nothing would be
-    left.
+    """Return an image (H, W) without a margin of `margin_px` on each side, or the whole image if
+    less than two rows or columns would be left.
     """
     if min(image.shape) <= 2 * margin_px + 1:
         return image
@@ -114,7 +162,18 @@ def inside(image: np.ndarray, margin_px: int) -> np.ndarray:
 
 
 def fidelity(image: np.ndarray, result: np.ndarray, radius_px: int, flat: bool) -> list[Measure]:
-    """Measure the effect of a restoration (H, W) on contrast and, on flat ground, on brightness."""
+    """Measure if a restoration adds ringing and, on flat ground, if it changes the brightness.
+
+    Args:
+        image: the raw image (H, W) in DN.
+        result: the restored image (H, W) in DN.
+        radius_px: the network's receptive radius, within which the border has an effect.
+        flat: True if all pixels of the raw image are equal.
+
+    Returns:
+        The ringing away from the border; on flat ground also the change of the mean there, and the
+        largest change of any pixel.
+    """
     inner = inside(result, radius_px)
     measures = [ringing(inner, inside(image, radius_px), radius_px, RINGING_PERCENT)]
     if flat:
@@ -130,15 +189,17 @@ NETWORKS = ("float32", "INT8")
 
 @dataclass(frozen=True)
 class Limitation:
-    """A known limitation. Beyond its ceiling it is a failure like any other.
+    """A known limitation of the networks, which explains some measures outside their bounds.
+
+    A measure beyond the ceiling of the limitation is a failure all the same.
 
     Attributes:
-        name: as in the tables.
-        checks: the checks that it explains.
-        ceiling: the largest value of such a check that it explains.
+        name: the name in tables.
+        checks: the names of the checks that it explains.
+        ceiling: the largest value of such a check that it explains, in the unit of the check.
         meaning: its meaning for a user, in a sentence.
-        cases: the hard cases that it applies to; none for all.
-        stages: the stages at which it is known.
+        cases: the names of the hard cases that it applies to; empty for all cases.
+        stages: the names of the stages (ways of running the networks) at which it is known.
     """
 
     name: str
@@ -186,7 +247,13 @@ LIMITATIONS: tuple[Limitation, ...] = (
 
 
 def limitation_of(stage: str, case: str, measure: Measure) -> Limitation | None:
-    """Return the limitation that explains a measure outside its bound, or None."""
+    """Return the known limitation that explains a measure outside its bound, or None.
+
+    Args:
+        stage: the name of the stage at which it was measured.
+        case: the name of the hard case.
+        measure: the measure.
+    """
     for limit in LIMITATIONS:
         applies = stage in limit.stages and measure.check in limit.checks
         if applies and case in (limit.cases or [case]) and measure.value <= limit.ceiling:

@@ -27,8 +27,12 @@ Shifts = dict[tuple[str, str], int]
 
 
 def flip_count(bits: int, per_megabit: float, generator: np.random.Generator) -> int:
-    """Draw the number of `bits` bits that flip, each independently with probability `per_megabit` /
-    10^6.
+    """Draw how many bits of a memory flip, if each flips independently.
+
+    Args:
+        bits: the number of bits in the memory.
+        per_megabit: the mean number of flips in 10^6 bits.
+        generator: draws the number.
     """
     return int(generator.binomial(bits, min(per_megabit / MEGABIT, 1.0)))
 
@@ -36,13 +40,13 @@ def flip_count(bits: int, per_megabit: float, generator: np.random.Generator) ->
 def flip_bits(
     values: np.ndarray, count: int, generator: np.random.Generator, bits: int = INT8_BITS
 ) -> np.ndarray:
-    """Return a copy of integers with `count` bits flipped. Signed types are in two's complement.
+    """Return a copy of integers in which random bits are flipped.
 
     Args:
-        values: integers of any shape, and of a type that holds them.
+        values: integers of any shape. Those of signed types are in two's complement.
         count: the number of different bits to flip.
         generator: draws which bits flip.
-        bits: the number of bits of one integer in memory.
+        bits: the number of bits that one integer has in the simulated memory; 8 by default.
     """
     choices = values.size * bits
     # Without replacement: a bit that flips twice would not have flipped.
@@ -59,8 +63,11 @@ def flip_bits(
 
 
 def as_stored(core: IntCore) -> IntCore:
-    """Return the core with its bias in int8, at the finest scale that holds it, as the board stores
-    it in memory.
+    """Return an integer core with its values as the board stores them in memory: each bias in int8,
+    at the finest scale that holds it.
+
+    Raises:
+        ModelError: a bias or a shift does not fit the memory of the board.
     """
     # A shift has six bits in memory, in two's complement.
     for (op, field), shift in shifts_of(core).items():
@@ -92,12 +99,14 @@ def _refused(actual: str) -> ModelError:
 
 
 def weight_bits(core: IntCore) -> int:
-    """Return the number of bits of all weights and bias in memory."""
+    """Return the number of bits of memory that hold the weights and bias of an integer core."""
     return INT8_BITS * sum(op.weight.size + op.bias.size for op in core.convolutions)
 
 
 def flip_weights(core: IntCore, count: int, generator: np.random.Generator) -> IntCore:
-    """Return the core with `count` random bits of its weights and bias flipped."""
+    """Return an integer core, as the board stores it, with `count` different random bits of its
+    weights and bias flipped.
+    """
     sizes = np.array([op.weight.size + op.bias.size for op in core.convolutions])
     # How many of the bits fall into each layer, as if all were drawn from one memory without
     # replacement.
@@ -111,7 +120,7 @@ def flip_weights(core: IntCore, count: int, generator: np.random.Generator) -> I
 
 
 def flip_conv(op: IntConv, count: int, generator: np.random.Generator) -> IntConv:
-    """Return the convolution with `count` bits of weights and bias flipped."""
+    """Return a convolution with `count` different random bits of its weights and bias flipped."""
     values = flip_bits(np.concatenate([op.weight.ravel(), op.bias]), count, generator)
     return replace(
         op, weight=values[: op.weight.size].reshape(op.weight.shape), bias=values[op.weight.size :]
@@ -119,19 +128,20 @@ def flip_conv(op: IntConv, count: int, generator: np.random.Generator) -> IntCon
 
 
 def with_ops(core: IntCore, others: Iterable[IntConv]) -> IntCore:
-    """Return the core with other convolutions in place of those of the same name."""
+    """Return an integer core in which the convolutions `others` replace those of the same name."""
     by_name = {op.name: op for op in others}
     return replace(core, ops=tuple(by_name.get(op.name, op) for op in core.ops))
 
 
 def map_channels(core: IntCore) -> dict[str, int]:
-    """Return the number of channels of every tensor that the core reads or writes."""
+    """Return the number of channels of every tensor of an integer core, by the tensor's name."""
     return channels_of(core.ops, {PLANES: core.host_part.planes})
 
 
 def shifts_of(core: IntCore) -> Shifts:
-    """Return the shifts of every operation, except shift_read of an add, which is 0 because a
-    stream shares one scale.
+    """Return the shifts, which scale sums by powers of two, by the names of operation and field.
+
+    The field shift_read of an add is left out: it is 0, because a stream shares one scale.
     """
     shifts: Shifts = {}
     for op in core.ops:
@@ -149,7 +159,7 @@ def bits_apart(shifts: Shifts, others: Shifts) -> int:
 
 
 def flip_shifts(shifts: Shifts, count: int, generator: np.random.Generator) -> Shifts:
-    """Return the shifts with `count` of their bits flipped."""
+    """Return shifts with `count` different random bits of them flipped, of six bits in each."""
     raw = flip_bits(np.array(list(shifts.values()), np.int16), count, generator, SHIFT_BITS)
     return dict(zip(shifts, raw.tolist(), strict=True))
 
@@ -160,12 +170,14 @@ RELU6_UNITS = (96, 48, 24, 12, 6, 3)
 
 @dataclass(frozen=True)
 class Guards:
-    """Bounds that a fault-free network never exceeds, and checksums of its weights.
+    """Guards of one network against bit flips: bounds that it did not exceed without faults, and
+    checksums of its weights.
 
     Attributes:
-        relu6: bound in units of each ReLU that has one, by its tensor.
-        limit_dn: bound of the correction's magnitude.
-        checksums: the checksums of each convolution, by name.
+        relu6: the upper bounds of ReLUs' outputs in int8, by the tensor's name; some have none.
+        limit_dn: the largest magnitude, in DN, of the correction that the network adds to an image.
+        checksums: the CRC-32 of the weights and bias of each convolution, by the convolution's
+            name.
     """
 
     relu6: Mapping[str, int]
@@ -173,14 +185,20 @@ class Guards:
     checksums: Mapping[str, int]
 
     def limit(self, correction: np.ndarray) -> np.ndarray:
-        """Clip a correction of any shape, in shares of full scale, to `limit_dn` on both sides."""
+        """Clip the correction that the network adds to an image, in shares of full scale and of any
+        shape, to `limit_dn` on both sides.
+        """
         bound = np.float32(self.limit_dn / MAX_DN)
         return np.asarray(np.clip(correction, -bound, bound), np.float32)
 
 
 def learn_guards(core: IntCore, planes: Iterable[np.ndarray]) -> Guards:
-    """Learn guards from the values that a fault-free core reaches on calibration patches, planes
-    (N, 3, H, W) each.
+    """Learn the guards of a network from the values that it reaches on calibration patches without
+    faults.
+
+    Args:
+        core: the integer core as the board stores it.
+        planes: batches of patches, (N, P, H, W) int8 each, as the host encodes images for the core.
     """
     relus = {op.output: 0 for op in core.convolutions if op.activation is Activation.relu}
     largest_dn = 0.0
@@ -199,7 +217,7 @@ def learn_guards(core: IntCore, planes: Iterable[np.ndarray]) -> Guards:
 
 
 def checksums(core: IntCore) -> dict[str, int]:
-    """Return the CRC-32 of each convolution's weights and bias."""
+    """Return the CRC-32 of each convolution's weights and bias, by the name of the convolution."""
     return {
         op.name: zlib.crc32(op.bias.tobytes(), zlib.crc32(op.weight.tobytes()))
         for op in core.convolutions
@@ -207,24 +225,31 @@ def checksums(core: IntCore) -> dict[str, int]:
 
 
 def scrubbed(core: IntCore, sound: IntCore, checks: Mapping[str, int]) -> IntCore:
-    """Return the core after scrubbing: every convolution whose checksum differs from that in
-    `checks` is replaced by a valid copy.
+    """Repair the weights of an integer core by their checksums (scrubbing).
+
+    Args:
+        core: the core, whose weights may have flipped bits.
+        sound: the core without faults.
+        checks: the CRC-32 of each convolution without faults, by name.
+
+    Returns:
+        The core in which every convolution with another checksum is replaced by that of `sound`.
     """
     wrong = {name for name, _ in checksums(core).items() - checks.items()}
     return with_ops(core, (op for op in sound.convolutions if op.name in wrong))
 
 
 def voted(copies: tuple[Shifts, Shifts, Shifts]) -> Shifts:
-    """Return the shifts by majority vote of three copies, bit by bit (triple modular
-    redundancy).
-    """
+    """Return the majority of three copies of the shifts, bit by bit (triple modular redundancy)."""
     a, b, c = copies
     return {key: (a[key] & b[key]) | (a[key] & c[key]) | (b[key] & c[key]) for key in a}
 
 
 def guarded(faults: Faults, guards: Guards) -> Faults:
-    """Return the same faults in a clamped network, where a result is bounded before memory can
-    corrupt it.
+    """Return the same faults for a network whose ReLUs are bounded.
+
+    Each ReLU's output is clipped to its bound before it is stored, so that a flip in memory acts on
+    the clipped value.
     """
 
     def touch(name: str, tensor: np.ndarray) -> np.ndarray:
@@ -236,12 +261,12 @@ def guarded(faults: Faults, guards: Guards) -> Faults:
 
 @dataclass(frozen=True)
 class Injected:
-    """A network and an image after an injection.
+    """A network and an image after an injection of bit flips into one kind of memory.
 
     Attributes:
-        core: with the weights after the injection.
-        faults: the faults elsewhere.
-        image: (1, 1, H, W), after the injection.
+        core: the integer core with its weights after the injection.
+        faults: the faults in shifts and feature maps, which act while the core runs.
+        image: the image (1, 1, H, W) in [0, 1] after the injection.
         flips: the number of flipped bits.
     """
 
@@ -252,8 +277,15 @@ class Injected:
 
 
 def restored(injected: Injected, guards: Guards | None = None) -> np.ndarray:
-    """Return the restored image (1, 1, H, W) in [0, 1]. Guards enable the ReLU6 and the limit of
-    the correction.
+    """Restore the image of an injection with the faulty network, by integer arithmetic.
+
+    Args:
+        injected: the network and the image after the injection.
+        guards: the bounds of the ReLUs and of the correction, which are then applied; None applies
+            none.
+
+    Returns:
+        The restored image (1, 1, H, W), float32 in [0, 1].
     """
     faults = guarded(injected.faults, guards) if guards else injected.faults
     core = injected.core
@@ -318,16 +350,15 @@ def _image(
 
 @dataclass(frozen=True)
 class Memory:
-    """One kind of memory, and how faults are injected into it.
+    """One kind of memory of the board, and how bit flips are injected into it.
 
     Attributes:
-        inject: injects faults into a core as the board stores it and an image (1, 1, H, W), at a
-            rate of flips in a megabit.
-        rates: bit flips in a megabit, of 10^6, that are tried.
-        times: factor of the number of draws, for memory in which few draws flip a bit. Draws
-            without a flip cost nothing.
-        persistent: True if it lives longer than a tile, so that scrubbing has something to
-            compare it with.
+        inject: the function that flips bits, given a core as the board stores it, an image
+            (1, 1, H, W), the rate of flips and a random generator.
+        rates: the rates that are tried, in flips per megabit of 10^6 bits.
+        times: the factor of the number of injections, because few of them hit a small memory.
+        persistent: True if the memory lives longer than a tile, so that scrubbing and voting can
+            repair it before the next image.
     """
 
     inject: Callable[[IntCore, np.ndarray, float, np.random.Generator], Injected]
@@ -352,16 +383,15 @@ def corrected(
     per_megabit: float,
     generator: np.random.Generator,
 ) -> Injected:
-    """Return the network after scrubbing and triple modular redundancy, before the next image.
-
-    The other two copies of the shifts suffer flips at the same rate, independently.
+    """Repair a network after an injection, as the host does before the next image: the weights by
+    their checksums, the shifts by a majority vote of three copies.
 
     Args:
-        injected: its shifts are the first of the three copies.
+        injected: the network after the injection, whose shifts are the first of the three copies.
         sound: the core without faults.
-        guards: with the checksums of its weights.
-        per_megabit: rate of flips in the other copies.
-        generator: draws which bits flip.
+        guards: the guards of the network, with the checksums of its weights.
+        per_megabit: the rate of flips in the other two copies of the shifts, independently.
+        generator: draws which bits of these copies flip.
     """
     core = scrubbed(injected.core, sound, guards.checksums)
     own = {**shifts_of(sound), **injected.faults.shifts}

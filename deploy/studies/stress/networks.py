@@ -49,14 +49,18 @@ WHOLE_PX = 4096
 
 @dataclass(frozen=True)
 class Runner:
-    """A network that restores images of any size, on any number of threads."""
+    """A network under test, which restores images of any size in memory with onnxruntime.
+
+    Attributes:
+        source: the loaded network.
+    """
 
     source: Network
     _sessions: dict[int, ort.InferenceSession] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def tiling(self) -> Tiling:
-        """The tiling geometry for an image of any size."""
+        """The tiling geometry of the network: its receptive radius, stride and scale."""
         return tiling_of(any_size(self.source.model))
 
     def extended(self, image: np.ndarray) -> np.ndarray:
@@ -67,14 +71,31 @@ class Runner:
         return np.pad(image, ((0, 0), (0, 0), (0, lack[0]), (0, lack[1])), mode="edge")
 
     def infer(self, threads: int = 1) -> Infer:
-        """Return the network ready to run on `threads` threads, opened once for each number."""
+        """Return the network ready to run, opened once for each number of threads.
+
+        Args:
+            threads: the number of threads of onnxruntime.
+
+        Returns:
+            A function from images (N, 1, H, W) float32 in [0, 1] to the network's results.
+        """
         if threads not in self._sessions:
             self._sessions[threads] = open_session(any_size(self.source.model), threads)
         return partial(run, self._sessions[threads])
 
     def restore(self, image: np.ndarray, threads: int = 1, tile_px: int = WHOLE_PX) -> np.ndarray:
-        """Restore digital numbers (H, W) float as `restore` does: tiled, clipped, not rounded.
-        Missing pixels stay.
+        """Restore one image as `restore` does, without the steps around the network.
+
+        Args:
+            image: digital numbers (H, W) of 12 bits, float; NaN marks a missing pixel.
+            threads: the number of threads of onnxruntime.
+            tile_px: the side of a tile; the default is larger than any hard case.
+
+        Returns:
+            Restored digital numbers (H, W), clipped to 12 bits, not rounded; NaN stays.
+
+        Raises:
+            ImageError: a pixel is infinite or outside 12 bits.
         """
         plan = make_plan((1, *image.shape), tile_px, self.tiling.halo_px, self.tiling)
         return restore_floats(image, self.infer(threads), plan, FULL_DN)
@@ -82,11 +103,11 @@ class Runner:
 
 @dataclass(frozen=True)
 class Subject:
-    """The networks under test.
+    """The networks under test: a float network and, if there is one, its INT8 network.
 
     Attributes:
-        float32: the float one.
-        int8: the INT8 one, or None.
+        float32: the float network.
+        int8: the INT8 network; None if only the float network is tested.
     """
 
     float32: Runner
@@ -94,13 +115,13 @@ class Subject:
 
     @property
     def by_name(self) -> dict[str, Runner]:
-        """The available networks, by the name of their precision."""
+        """The networks under test by precision, "float32" and, if there is one, "INT8"."""
         networks = {"float32": self.float32, "INT8": self.int8}
         return {name: network for name, network in networks.items() if network is not None}
 
     @property
     def inputs(self) -> tuple[Input, ...]:
-        """The files of the networks."""
+        """The networks under test as inputs of a table of results, with their digests."""
         return tuple(network.source.input for network in self.by_name.values())
 
     @cached_property
@@ -115,12 +136,20 @@ class Subject:
 
     @cached_property
     def core(self) -> IntCore:
-        """The integer core stored in the INT8 file."""
+        """The integer operations that the INT8 network's file stores.
+
+        Raises:
+            ModelError: there is no INT8 network, or its file has no integer core.
+        """
         return read_core(self.quantized.source.model)
 
     @property
     def quantized(self) -> Runner:
-        """The INT8 network."""
+        """The INT8 network.
+
+        Raises:
+            ModelError: only a float network is tested.
+        """
         if self.int8 is None:
             raise ModelError("The INT8 network is missing. Give its file as the second argument.")
         return self.int8
@@ -131,13 +160,18 @@ def open_subject(
     int8_network: NetworkLike | None = None,
     sensor: SensorLike = SENSOR,
 ) -> Subject:
-    """Open a float network and its INT8 network, if there is one.
+    """Open the networks to test: a float network and, if there is one, its INT8 network.
 
     Args:
-        float_network: a shipped name, or an INT8 network that was quantised in this process, stands
-            for both; the default pair if None.
-        int8_network: None tests only the float network, unless `float_network` stands for both.
+        float_network: the float network. A shipped name, or an INT8 network that was quantised in
+            this process, stands for both networks; None for the default pair.
+        int8_network: the INT8 network; None tests only the float network, unless `float_network`
+            stands for both.
         sensor: the sensor that shipped networks are conditioned on.
+
+    Raises:
+        ModelError: a network cannot be tiled, reads other values than [0, 1], or the float and the
+            INT8 network are swapped.
     """
     profile = Sensor.load(sensor)
     if int8_network is not None or _is_pair(float_network):
@@ -167,8 +201,14 @@ def _is_pair(network: NetworkLike | None) -> bool:
 
 
 def in_torch(graph: Graph, image: Tensor) -> Tensor:
-    """Return an image (N, 1, H, W) plus the graph's correction, computed in the image's
-    precision.
+    """Run a network in torch, in the precision of the image, such as float64.
+
+    Args:
+        graph: the network's convolutions and additions, which compute a correction of the image.
+        image: shares of full scale, (N, 1, H, W).
+
+    Returns:
+        The image plus its correction, (N, 1, H, W), not clipped.
     """
     place_px = math.isqrt(image_channels(graph))
     tensors = {IMAGE: pixel_unshuffle(image, place_px)}
@@ -184,8 +224,15 @@ def in_torch(graph: Graph, image: Tensor) -> Tensor:
 
 
 def steepest_signs(graph: Graph, image: np.ndarray) -> np.ndarray:
-    """Return the change (H, W) of -1, 0 or 1 that moves the middle pixel most to first order: the
-    signs of its gradient.
+    """Return the change of the input that moves the restored pixel in the middle most, to first
+    order.
+
+    Args:
+        graph: the network's convolutions and additions.
+        image: shares of full scale, (H, W).
+
+    Returns:
+        The signs of the gradient of the middle pixel, -1, 0 or 1, (H, W).
     """
     pixels = torch.from_numpy(image)[None, None].requires_grad_()
     middle = in_torch(graph, pixels)[0, 0, image.shape[0] // 2, image.shape[1] // 2]
@@ -214,7 +261,10 @@ LARGE_CORE_PX = 250
 def float32(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
     """Check the float network in float32, and against float64 if it has only convolutions.
 
-    The image is (H, W) in DN.
+    Args:
+        subject: the networks under test.
+        case: the hard case that the image belongs to.
+        image: the image (H, W) in DN.
     """
     network = subject.float32
     graph = subject.graph
@@ -244,7 +294,16 @@ def int8(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure
 def restoration(
     network: Runner, case: Case, image: np.ndarray, gain_dn: float
 ) -> list[checks.Measure]:
-    """Return the measures that apply to any network on an image (H, W) in DN, whatever runs it."""
+    """Run the checks that apply to a network of any precision: finite and in range, the same in
+    every run, ringing, brightness and gain.
+
+    Args:
+        network: the network.
+        case: the hard case that the image belongs to. If its pixels are infinite or beyond 12 bits,
+            the network must refuse the image.
+        image: the image (H, W) in DN.
+        gain_dn: the largest change of a restored pixel that a change of 1 DN may cause.
+    """
     if case.pixels in ("infinite", "beyond"):
         return [checks.refused(lambda: network.restore(image))]
     result = network.restore(image)
@@ -266,10 +325,10 @@ def restoration(
 def reference(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
     """Check the INT8 network by the integer reference, layer by layer.
 
-    The runtime must agree with it bit for bit, no accumulator may exceed its proven bound, and only
-    layers whose bounds allow it may saturate. Rounding ties up, as a DPU does, may change the
-    result by at most ROUNDING_DN. Images (H, W) are cropped to CROP_PX, because the reference is
-    slow.
+    The reference computes the integers of each layer in NumPy. The runtime must agree with it bit
+    for bit, no accumulator may exceed its proven bound, and only layers whose bounds allow it may
+    saturate. Rounding ties up, as a DPU does, may change the result by at most ROUNDING_DN. Images
+    (H, W) in DN are cropped to CROP_PX, because the reference is slow.
     """
     core = subject.core
     network = subject.quantized
@@ -308,7 +367,8 @@ def _fractions(image: np.ndarray) -> np.ndarray:
 def tiling(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
     """Compare both networks, tiled by several plans, with the whole image (H, W).
 
-    Each plan must refuse pixels that are infinite or beyond 12 bits.
+    The tiles must give the result of the whole image, bit for bit. If the pixels of the case are
+    infinite or beyond 12 bits, the networks must refuse the image in tiles too.
     """
     measures = []
     cores_px = (LARGE_CORE_PX,) if case.large else CORES_PX

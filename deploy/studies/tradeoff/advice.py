@@ -44,13 +44,20 @@ CONSTRAINT = re.compile(
 
 
 def with_unit(text: str, unit: str) -> str:
-    """Return a number with its unit, if that is written after numbers."""
+    """Append the unit to a number, such as "20 s"; ratios and distances are written without one."""
     return text if unit in BARE_UNITS else f"{text} {unit}"
 
 
 @dataclass(frozen=True)
 class Constraint:
-    """An upper or lower limit of a figure."""
+    """A limit that a user sets on one figure of an operating point, such as `latency<=20s`.
+
+    Attributes:
+        key: the name of the figure.
+        at_most: True for an upper limit, False for a lower one.
+        limit: the limit, in the unit of the figure.
+        unit: the unit of the figure.
+    """
 
     key: str
     at_most: bool
@@ -62,8 +69,8 @@ class Constraint:
         return f"{self.key} {sign} {with_unit(f'{self.limit:g}', self.unit)}"
 
     def violation(self, point: Measured) -> float:
-        """Return the violation by a point as a share of the limit: 0 if it complies, infinity if it
-        lacks the figure.
+        """Return by how much an operating point misses the limit, as a share of the limit: 0 if it
+        complies, infinity if it lacks the figure.
         """
         over = point.value(self.key) - self.limit
         miss = over if self.at_most else -over
@@ -71,13 +78,23 @@ class Constraint:
         return math.inf if math.isnan(miss) else max(miss, 0.0) / (abs(self.limit) or 1.0)
 
     def holds_throughout(self, figure: Figure) -> bool:
-        """Return True if the figure's whole interval complies."""
+        """Return True if the whole interval of a figure complies with the limit, not only its
+        value.
+        """
         low, high = ends(figure)
         return high <= self.limit if self.at_most else low >= self.limit
 
 
 def parse_constraints(option: str, text: str | None) -> list[Constraint]:
-    """Parse constraints separated by commas: `latency<=20s, psnr>=44`."""
+    """Parse the limits that a user gives, separated by commas, such as `latency<=20s, psnr>=44`.
+
+    Args:
+        option: the name of the option, for messages.
+        text: the value of the option; None gives no limit.
+
+    Raises:
+        OptionError: a part has another form, or names an unknown figure or another unit.
+    """
     return [_parse(option, part.strip()) for part in text.split(",")] if text is not None else []
 
 
@@ -105,12 +122,12 @@ def _parse(option: str, text: str) -> Constraint:
 
 @dataclass(frozen=True)
 class Question:
-    """The limits under which points of all boards are compared.
+    """The question of a study: which operating point is best within the user's limits.
 
     Attributes:
-        budget: upper limits of costs.
-        need: limits of quality that must be reached.
-        compare: determines which of two points is better.
+        budget: limits that the costs of a point must keep, such as latency or power.
+        need: limits that its quality must reach, such as PSNR.
+        compare: compares the quality of two points on the same images.
     """
 
     budget: Sequence[Constraint]
@@ -119,12 +136,17 @@ class Question:
 
     @property
     def constraints(self) -> list[Constraint]:
-        """The budget and the need together."""
+        """All limits: those of the budget, then those of the need."""
         return [*self.budget, *self.need]
 
     def cost(self, points: Sequence[Measured]) -> str:
-        """Return the cost that the budget names, else the first that any point has, starting with
-        the board's latency.
+        """Return the name of the cost against which quality is compared.
+
+        This is the first cost that the budget limits; else the first of latency, energy and time on
+        this machine that any point has a value of.
+
+        Args:
+            points: the operating points.
         """
         limited = [constraint.key for constraint in self.budget]
         available = [
@@ -134,14 +156,14 @@ class Question:
 
 
 def recommend(points: Sequence[Measured], asked: Question) -> tuple[Measured | None, str]:
-    """Recommend the best PSNR within a budget, or the cheapest point that is not significantly
-    worse.
+    """Recommend an operating point within the user's limits.
 
-    For a need without a budget, the cheapest point is recommended.
+    It is the cheapest point whose PSNR is not significantly worse than the best one within the
+    limits. For a need without a budget, it is the cheapest point of all within the limits.
 
     Args:
-        points: the points of all boards that are compared.
-        asked: budget and need.
+        points: the operating points of all boards.
+        asked: the budget and the need.
 
     Returns:
         The recommended point, or None if none complies with the constraints, and a line that states
@@ -172,16 +194,26 @@ def recommend(points: Sequence[Measured], asked: Question) -> tuple[Measured | N
 def within(
     points: Iterable[Measured], constraints: Sequence[Constraint], cost: str
 ) -> list[Measured]:
-    """Return the points that comply with every constraint by value, sorted by increasing cost."""
+    """Return the points whose values comply with every constraint, sorted by increasing cost.
+
+    Args:
+        points: the operating points.
+        constraints: the limits.
+        cost: the name of the cost. Points without a value of this cost or of PSNR are left out.
+    """
     return [point for point in placed(points, cost) if not _violation(point, constraints)]
 
 
 def choose(candidates: Sequence[Measured], asked: Question) -> tuple[Measured, Measured]:
-    """Choose among points that comply with the constraints, sorted by increasing cost, at least
-    one.
+    """Choose the point to recommend, as `recommend` describes.
+
+    Args:
+        candidates: the points that comply with the constraints, sorted by increasing cost; at least
+            one.
+        asked: the budget and the need.
 
     Returns:
-        The chosen point, and the one with the best PSNR.
+        The chosen point, and the point with the best PSNR.
     """
     best = max(candidates, key=lambda point: point.value(PSNR))
     # A need without a budget asks for the cheapest point, however good it is.
@@ -201,18 +233,29 @@ def affordable(
 
     The front shows PSNR against one cost. Without this filter, a point that the budget excludes for
     another reason, such as its power, would hide those that can be recommended.
+
+    Args:
+        points: the operating points.
+        constraints: all limits of budget and need.
+        cost: the name of the cost that the front shows.
     """
     others = [constraint for constraint in constraints if constraint.key not in (PSNR, cost)]
     return within(points, others, cost) or points
 
 
 def _violation(point: Measured, constraints: Sequence[Constraint]) -> float:
-    """Return the largest violation of a constraint by a point."""
+    """Return by how much a point misses the constraint that it misses most; 0 if it complies."""
     return max((constraint.violation(point) for constraint in constraints), default=0.0)
 
 
 def nearest(points: Sequence[Measured], constraints: Sequence[Constraint]) -> str:
-    """Return the point with the smallest violation and its figures, as the end of a sentence."""
+    """Return the end of a sentence that names the point which comes nearest to the limits, if none
+    complies with them.
+
+    Args:
+        points: the operating points; may be empty.
+        constraints: the limits.
+    """
     comparable = [point for point in points if math.isfinite(_violation(point, constraints))]
     if not comparable:
         absent = [
@@ -235,14 +278,17 @@ def _words(point: Measured, keys: Sequence[str]) -> str:
 def board_rows(
     points: Sequence[Measured], boards: Sequence[str], recommended: Measured | None, asked: Question
 ) -> list[Row]:
-    """Return a row for each board: the figures of its best point, and how it compares with the
-    recommended one; or the reason why it has none.
+    """Compare the best point of each board with the recommended one.
 
     Args:
-        points: the points of all boards.
-        boards: names, in the order of the rows.
-        recommended: None if there is none.
-        asked: budget and need.
+        points: the operating points of all boards.
+        boards: the names of the boards, in the order of the rows.
+        recommended: the recommended point; None if no point complies with the limits.
+        asked: the budget and the need.
+
+    Returns:
+        A row for each board: the figures of its best point and a comparison in words, or the reason
+        why no point of the board complies.
     """
     cost = asked.cost(points)
     limits = f" keeps {' and '.join(map(str, asked.constraints))}" if asked.constraints else ""
@@ -275,8 +321,14 @@ def board_rows(
 
 
 def board_lines(rows: Sequence[Row]) -> list[str]:
-    """Return the rows of boards as sentences: those of several boards, or that of a single one if
-    it has no point.
+    """Return the sentences on boards that a study reports as notes.
+
+    Args:
+        rows: the rows that `board_rows` returns.
+
+    Returns:
+        A sentence for each of several boards. A single board has a sentence only if no point of it
+        complies with the limits.
     """
     return [
         f"{row.name}: {row.text['point'] + ': ' if row.figures else ''}{row.text['verdict']}"

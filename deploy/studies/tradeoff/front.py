@@ -36,14 +36,15 @@ TOO_FEW = "too few sites to tell"
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """A point with all its figures.
+    """An operating point (a method on a device, with its tiles) or a published run, with all its
+    figures.
 
     Attributes:
         name: the name of the point, or of a published run as it is printed.
-        figures: by name; unavailable ones have a reason.
-        text: the words next to the figures.
-        point: None for a published run.
-        images: scores of each image, in the order of the pairs; empty if there are none.
+        figures: quality and costs by name; unavailable ones have a reason.
+        text: facts in words by name, such as board, tile and halo.
+        point: the operating point; None for a published run.
+        images: the scores of each image, in the order of the pairs; empty for a published run.
     """
 
     name: str
@@ -53,8 +54,8 @@ class Measured:
     images: Sequence[Scores] = field(default=(), repr=False)
 
     def value(self, key: str) -> float:
-        """Return a figure's value, or NaN if it cannot be compared. A published figure was measured
-        on other images.
+        """Return the value of the figure named `key`, or NaN if the point lacks the figure or it is
+        published: a published figure was measured on other images.
         """
         figure = self.figures.get(key)
         if figure is None or figure.value is None or figure.mode == "published":
@@ -63,7 +64,11 @@ class Measured:
 
     @property
     def network(self) -> Network:
-        """The network that restores at this point."""
+        """The network that restores at this point.
+
+        Raises:
+            OptionError: the point is a published run or a method without a network.
+        """
         if self.point is None or self.point.variant.network is None:
             raise OptionError(f"The point {self.name} has no network. Choose a point of a network.")
         return self.point.variant.network
@@ -72,7 +77,12 @@ class Measured:
 def placed(points: Iterable[Measured], cost: str) -> list[Measured]:
     """Return the points that have both a cost and a PSNR to compare, sorted by increasing cost.
 
-    Ties are broken by values that do not depend on the order of the points.
+    Points of the same cost are sorted by descending PSNR, then by latency and name, so that the
+    result does not depend on the order of `points`.
+
+    Args:
+        points: the operating points and published runs.
+        cost: the name of the cost.
     """
 
     def rank(point: Measured) -> tuple[float, float, float, str]:
@@ -87,7 +97,9 @@ def placed(points: Iterable[Measured], cost: str) -> list[Measured]:
 
 
 def pareto_front(points: Sequence[Measured], cost: str) -> list[Measured]:
-    """Return the Pareto-optimal points by value, sorted by increasing cost."""
+    """Return the points for which no other is both cheaper and better in PSNR, sorted by increasing
+    cost. Values are compared, not their intervals.
+    """
     front: list[Measured] = []
     for point in placed(points, cost):
         if not front or point.value(PSNR) > front[-1].value(PSNR):
@@ -97,19 +109,19 @@ def pareto_front(points: Sequence[Measured], cost: str) -> list[Measured]:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Compares points by their scores on the same images.
+    """Compares the quality of two operating points on the same images.
 
     Attributes:
-        sites: the sites of the images, in their order.
-        seed: the seed of the bootstrap.
+        sites: the site of each image; images of one site resemble one another.
+        seed: the seed of the bootstrap over sites, which gives the interval.
     """
 
     sites: Sequence[str]
     seed: int
 
     def difference(self, a: Measured, b: Measured) -> Figure:
-        """Return the PSNR of `a` minus that of `b`, with the interval of the paired difference;
-        without one below five sites.
+        """Return the mean PSNR of `a` minus that of `b` in dB, with the interval of the paired
+        difference. There is no interval for fewer than five sites.
         """
         # Differences on the same images: how the images differ from one another drops out.
         pairs = zip(a.images, b.images, strict=True)
@@ -123,8 +135,8 @@ class Comparison:
 
 
 def significant(difference: Figure) -> bool:
-    """Return True if the whole interval is above 0. Without an interval, return True if the value
-    exceeds ALIKE_DB.
+    """Return True if a difference of PSNR shows that the first point is better: its whole interval
+    is above 0, or, without an interval, its value exceeds ALIKE_DB.
     """
     if difference.interval is None:
         return (difference.value or 0.0) > ALIKE_DB
@@ -132,8 +144,8 @@ def significant(difference: Figure) -> bool:
 
 
 def verdict(difference: Figure) -> str:
-    """Return the significance in words. A difference is not significant if its interval contains
-    0.
+    """Return the significance of a difference of PSNR in words: `SIGNIFICANT`, `NOT_SIGNIFICANT` if
+    the interval contains 0, or `TOO_FEW` if there is no interval.
     """
     if difference.interval is None:
         return TOO_FEW
@@ -142,11 +154,16 @@ def verdict(difference: Figure) -> str:
 
 
 def cost_ratio(a: Measured, b: Measured, cost: str) -> Figure:
-    """Return the cost of `a` divided by that of `b`, with an interval.
+    """Return the cost of point `a` divided by that of point `b`, with an interval.
 
     Two predictions for one board share most of their error. The interval of a ratio of latencies is
     therefore the board's `pair_width`, and empty if only the number of tiles differs. Predictions
     for two boards share no error.
+
+    Args:
+        a: an operating point.
+        b: another operating point.
+        cost: the name of the cost. Times on this machine have a ratio without an interval.
     """
     value = a.value(cost) / b.value(cost)
     source = f"{cost} over that of {b.name}"
@@ -169,12 +186,22 @@ def cost_ratio(a: Measured, b: Measured, cost: str) -> Figure:
 
 
 def ends(figure: Figure) -> tuple[float, float]:
-    """Return the interval, or the value twice if there is none."""
+    """Return the lower and the upper end of a figure's interval, or its value twice without one."""
     return figure.interval or (figure.value or 0.0, figure.value or 0.0)
 
 
 def front_rows(front: Sequence[Measured], cost: str, compare: Comparison) -> list[Row]:
-    """Return a front's members by number, each with its difference from the next cheaper one."""
+    """Return the rows of the front of quality against cost, numbered from the cheapest point.
+
+    Args:
+        front: the points for which no other is both cheaper and better, sorted by increasing cost.
+        cost: the name of the cost.
+        compare: compares the PSNR of two points on the same images.
+
+    Returns:
+        A row for each point: its figures, the gain in PSNR over the next cheaper point, and the
+        ratio of their costs.
+    """
     rows: list[Row] = []
     for place, point in enumerate(front, 1):
         figures = figures_to_compare(point, cost)
@@ -190,8 +217,8 @@ def front_rows(front: Sequence[Measured], cost: str, compare: Comparison) -> lis
 
 
 def figures_to_compare(point: Measured, cost: str) -> dict[str, Figure]:
-    """Return the figures by which points are compared: PSNR, the cost, and power and energy of a
-    board.
+    """Return the figures of a point that tables of comparison show, by name: PSNR, the cost, and
+    the board's power and energy, as far as the point has them.
     """
     keys = dict.fromkeys((PSNR, cost, "board power", "board energy"))
     return {key: point.figures[key] for key in keys if key in point.figures}

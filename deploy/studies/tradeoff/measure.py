@@ -40,15 +40,15 @@ NOT_SHOWN = (*DETAILS, SEAM_ERROR)
 
 @dataclass(frozen=True)
 class Benchmark:
-    """The data that all variants are measured on.
+    """The images and metrics with which all methods of a study are measured.
 
     Attributes:
-        pairs: held-out images, degraded and reference.
-        degraded: sensor of the degraded images.
-        reference: sensor of the reference images.
-        lpips: weights of SqueezeNet 1.1, or a folder of backbones; None reads the path from the
-            environment.
-        seed: the seed of the bootstrap.
+        pairs: pairs of a degraded and a reference image that no network was trained on.
+        degraded: the sensor of the degraded images.
+        reference: the sensor of the reference images.
+        lpips: the file with the weights of SqueezeNet 1.1 for LPIPS, or a folder of such files;
+            None reads the path from the environment.
+        seed: the seed of the bootstrap over sites, which gives the intervals.
     """
 
     pairs: Sequence[NamedPair]
@@ -59,19 +59,26 @@ class Benchmark:
 
     @cached_property
     def instruments(self) -> Instruments:
-        """PSNR, SSIM and LPIPS."""
+        """The metrics: PSNR, SSIM and LPIPS; loaded at the first use."""
         return Instruments(
             {LPIPS: perceptual_distances(self.lpips)[LPIPS]}, self.degraded.nominal().max_dn
         )
 
     @property
     def sites(self) -> list[str]:
-        """The site of each pair."""
+        """The site of each pair, in their order; images of one site resemble one another."""
         return [pair.site for pair in self.pairs]
 
     def cuts(self, point: Point) -> tuple[int, ...]:
-        """Return the sides of the tiles into which a point with seams cuts the images; empty if its
-        seams are exact. Points that differ in nothing else have the same scores.
+        """Return how an operating point cuts the images, so that points which restore the same
+        pixels are scored once.
+
+        Args:
+            point: the operating point.
+
+        Returns:
+            The different sides of its tiles in pixels, in ascending order; empty if its halo is
+            exact, because tiles of any size then give the same pixels.
         """
         if point.halo_px is None:
             return ()
@@ -79,16 +86,27 @@ class Benchmark:
         return tuple(sorted({tiles_of_point(point, shape).tile_px for shape in shapes}))
 
     def scores(self, point: Point, exact: Restore) -> list[Scores]:
-        """Return the scores of each image: those of the exact restoration, or with seams if the
-        halo is too small for that.
+        """Restore all images as an operating point does, and score them.
+
+        Args:
+            point: the operating point.
+            exact: the point's method without seams between tiles, a function from degraded to
+                restored digital numbers (H, W).
+
+        Returns:
+            The scores of each image. If the point's halo leaves seams, the images are restored in
+            its tiles, and their mean difference from `exact` is a score too.
         """
         if point.halo_px is None:
             return self.score(exact)
         return self.score(restore_in_tiles(point, self.degraded, self.reference), exact)
 
     def runs(self, point: Point) -> float:
-        """Return the mean number of runs of a point's network on a tile of the images, one for each
-        exposure.
+        """Return how often the network of an operating point runs on a tile, as the mean over the
+        tiles of the images.
+
+        A tile needs one run for each exposure: dark parts are multiplied by a factor before the
+        network. The number is 1 without a network or without exposures.
         """
         network = point.variant.network
         if network is None or not network.exposures:
@@ -106,8 +124,15 @@ class Benchmark:
         return runs / tiles
 
     def score(self, restore: Restore, exact: Restore | None = None) -> list[Scores]:
-        """Return the scores of every pair. If an exact restoration is given, also return the
-        difference from it in DN.
+        """Restore the degraded image of every pair, and score it.
+
+        Args:
+            restore: the method, a function from degraded to restored digital numbers (H, W).
+            exact: the same method without seams between tiles; None for no comparison with it.
+
+        Returns:
+            The scores of each image by name. With `exact`, 'seam error' is the mean absolute
+            difference from it in digital numbers.
         """
         scores = []
         for pair in self.pairs:
@@ -119,7 +144,14 @@ class Benchmark:
         return scores
 
     def means(self, images: Sequence[Scores]) -> dict[str, Figure]:
-        """Return the means over the images, with bootstrap intervals over whole sites."""
+        """Average scores over the images, with bootstrap intervals over whole sites.
+
+        Args:
+            images: the scores of each image, as `score` returns them.
+
+        Returns:
+            The means by name, without scores that only add detail, and the mean seam error.
+        """
         plain = [
             {key: value for key, value in image.items() if key not in NOT_SHOWN} for image in images
         ]
@@ -132,8 +164,16 @@ class Benchmark:
 
 
 def restore_in_tiles(point: Point, degraded: Sensor, reference: Sensor) -> Restore:
-    """Return the restoration by a network in a point's tiles, with the steps around it that
-    `restore` uses.
+    """Build the function that restores an image by a network in the tiles of an operating point,
+    with the exposures and the consistency step that `restore` uses.
+
+    Args:
+        point: an operating point of a network.
+        degraded: the sensor of the images.
+        reference: the sensor that the restoration aims at.
+
+    Returns:
+        A function from degraded to restored digital numbers, (H, W) each.
     """
     source = network_of_variant(point.variant)
     sensor = degraded.nominal()
@@ -144,8 +184,14 @@ def restore_in_tiles(point: Point, degraded: Sensor, reference: Sensor) -> Resto
 
 
 def tiles_of_point(point: Point, shape: tuple[int, ...]) -> Plan:
-    """Return the tiles of a point on an image (H, W). An image no larger than a tile is cut in two
-    along each side.
+    """Plan the tiles in which an operating point restores an image.
+
+    An image that is no larger than a tile is cut in two along each side, because an image in one
+    tile would show no seam.
+
+    Args:
+        point: an operating point of a network.
+        shape: the shape of the image, (H, W).
     """
     tiling = network_of_variant(point.variant).tiling
     halo_px = tiling.halo_px if point.halo_px is None else point.halo_px
@@ -161,8 +207,15 @@ ROUNDS = 9
 def measure_host(
     methods: Mapping[Variant, Method], benchmark: Benchmark
 ) -> dict[Variant, dict[str, Figure]]:
-    """Measure the time of each variant on this machine. All are timed together on a drawn scene as
-    the sensor sees it.
+    """Measure the time that each method needs on this machine, on one tile of a drawn scene as the
+    sensor acquires it. All methods are timed in turn, so that they share the machine's state.
+
+    Args:
+        methods: the method of each variant (a method in one precision).
+        benchmark: states the sensors and the seed.
+
+    Returns:
+        For each variant the figures that `host_figures` returns.
     """
     tile = drawn_acquisition(
         Swath(TILE_PX, TILE_PX), benchmark.degraded, benchmark.reference, benchmark.seed
@@ -173,8 +226,14 @@ def measure_host(
 
 
 def host_times(restores: Iterable[Restore], tile: np.ndarray) -> list[list[float]]:
-    """Return the seconds that each method needs for a tile on this machine, interleaved, after one
-    warm-up run.
+    """Time methods on one tile on this machine, after one warm-up run of each.
+
+    Args:
+        restores: functions from degraded to restored digital numbers (H, W).
+        tile: digital numbers (H, W).
+
+    Returns:
+        For each method the seconds of `ROUNDS` runs. In each round every method runs once.
     """
     calls = [partial(restore, tile) for restore in restores]
     for call in calls:
@@ -183,7 +242,14 @@ def host_times(restores: Iterable[Restore], tile: np.ndarray) -> list[list[float
 
 
 def host_figures(times_s: Sequence[float], pixels: int) -> dict[str, Figure]:
-    """Return the median and the 90th percentile of the time for a million pixels, in s."""
+    """Return the figures of a method's time on this machine, 'host p50' and 'host p90'.
+
+    They are the median and the 90th percentile of the seconds for a million pixels.
+
+    Args:
+        times_s: the seconds of each run on a tile.
+        pixels: the number of pixels of the tile.
+    """
     source = (
         f"{len(times_s)} runs of a tile of {TILE_PX} x {TILE_PX}, interleaved with the "
         "other methods"
@@ -200,13 +266,19 @@ PATCH_PX = 96
 
 
 def make_int8(network: Network, scenes: Path | None, sensor: Sensor, seed: int) -> Network:
-    """Quantise a float network on simulated patches as `quantize` does.
+    """Quantise a float network as `quantize` does, on fewer and smaller simulated patches.
 
     Args:
-        network: in float32.
-        scenes: folder of images to calibrate on; drawn ones if None.
-        sensor: the sensor of the patches, if the network names no known one.
+        network: the network in float32.
+        scenes: the folder of images that the patches are simulated from; None draws scenes.
+        sensor: the sensor of the patches, if the network states no shipped sensor.
         seed: the seed of every random draw.
+
+    Returns:
+        The INT8 network in memory, named NETWORK-int8.
+
+    Raises:
+        ModelError: the network cannot be quantised.
     """
     named = network.sensor
     calibration_sensor = Sensor.load(named) if named in sensor_names() else sensor

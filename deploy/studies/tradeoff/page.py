@@ -87,13 +87,15 @@ class Tradeoff(Table):
 
     Attributes:
         boards: the names of all boards that were compared.
-        points: all of them, in the order networks, pipelines, other libraries, the paper's runs.
-        front: those on the Pareto front over all boards, sorted by increasing cost.
-        constraints: budget and need.
-        cost: the name of the figure that quality is traded against, such as "latency".
-        best: the recommended point; None if none complies with the budget and the need.
-        line: the sentence that recommends it.
-        remarks: how the figures were measured.
+        points: all operating points (a method on a device, with its tiles), in the order networks,
+            traditional pipelines, other libraries, the paper's published runs.
+        front: the points for which no other is both cheaper and better, over all boards, sorted by
+            increasing cost.
+        constraints: the user's limits of budget and need.
+        cost: the name of the figure that quality is traded against, such as "board latency".
+        best: the recommended point; None if no point complies with the constraints.
+        line: the sentence that states the recommendation.
+        remarks: sentences on how the figures were measured.
     """
 
     boards: Sequence[str]
@@ -107,17 +109,23 @@ class Tradeoff(Table):
 
     @property
     def front_rows(self) -> list[Row]:
-        """The front by number, each point with its difference from the next cheaper one."""
+        """The rows of the front, numbered from the cheapest point, each with its gain in PSNR over
+        the next cheaper one.
+        """
         return [row for row in self.rows if row.table.startswith(FRONT)]
 
     @property
     def board_rows(self) -> list[Row]:
-        """For each board its best point within the limits, or the reason why it has none."""
+        """The rows of the boards, each with the board's best point within the constraints, or the
+        reason why it has none.
+        """
         return [row for row in self.rows if row.table == BOARDS]
 
     @property
     def board(self) -> str:
-        """The board of the recommended point; the first board if there is none."""
+        """The name of the board of the recommended point; the first board if no point is
+        recommended or the point runs on this machine.
+        """
         # A point of this machine alone has no board among those that were compared.
         name = self.best.text["board"] if self.best else ""
         return name if name in self.boards else self.boards[0]
@@ -127,8 +135,12 @@ class Tradeoff(Table):
         budget.
 
         Args:
-            figure: if given, draw bars of that figure instead, as for any table.
-            ax: axes of matplotlib to draw on; new ones if None.
+            figure: the name of a figure of which bars are drawn instead, as for any table; None
+                draws the plot of PSNR against cost.
+            ax: axes of matplotlib to draw on; None makes new ones.
+
+        Returns:
+            The axes.
         """
         if figure is not None:
             return super().plot(figure, ax)
@@ -137,7 +149,7 @@ class Tradeoff(Table):
         return cast("Axes", axes)
 
     def report(self, folder: str | os.PathLike[str]) -> Path:
-        """Write the page and its plot into a folder, and return the page's path."""
+        """Write tradeoff.html and tradeoff.svg into a folder, and return the path of the page."""
         svg = plot_svg(self)
         page, plot = (Path(folder) / name for name in FILES)
         write_text(plot, svg)
@@ -146,7 +158,12 @@ class Tradeoff(Table):
 
 
 def report_of(study: Tradeoff, svg: str) -> Report:
-    """Compose the page in reading order."""
+    """Arrange the result of a study as a page: recommendation, plot, boards, front and all points.
+
+    Args:
+        study: the result.
+        svg: the plot, as `plot_svg` returns it.
+    """
     picture = Picture(f"{PSNR} against {study.cost}", data_url(svg), CAPTION)
     points = []
     for point in study.points:
@@ -164,8 +181,15 @@ def report_of(study: Tradeoff, svg: str) -> Report:
 
 
 class Series(NamedTuple):
-    """Points of one style: those of one network, of the pipelines, or of other libraries, on one
-    board.
+    """The points of a plot that share one colour and marker.
+
+    Attributes:
+        name: the network, `PIPELINES` for all traditional pipelines, or `LIBRARIES` for all methods
+            of other libraries.
+        board: the board that the points run on, or `HOST`.
+        colour: the colour of the marks, as matplotlib accepts it.
+        marker: the shape of the marks, as matplotlib accepts it.
+        points: the operating points.
     """
 
     name: str
@@ -176,7 +200,9 @@ class Series(NamedTuple):
 
 
 def plot_svg(study: Tradeoff) -> Markup:
-    """Return the plot as an SVG file, with the numbers of the front's members."""
+    """Draw PSNR against cost, and return the text of an SVG file. The points of the front have the
+    numbers of its table.
+    """
     with look():
         return svg_of(
             figure_of(study), f"{PSNR} against {study.cost}; numbers as in the table of the front"
@@ -184,7 +210,9 @@ def plot_svg(study: Tradeoff) -> Markup:
 
 
 def figure_of(study: Tradeoff) -> "Figure":
-    """Draw the plot. Call this within `look`."""
+    """Draw PSNR against cost on a new figure of matplotlib. Call this within the context `look`,
+    which sets the style.
+    """
     from matplotlib import rc_context
 
     with rc_context({"font.size": TEXT_PX}):
@@ -202,8 +230,8 @@ def figure_of(study: Tradeoff) -> "Figure":
 
 
 def draw(axes: "Axes", study: Tradeoff) -> None:
-    """Draw points, front, limits and recommended point. The caller adds the numbers once it has
-    sized the axes.
+    """Draw points, front, limits and the recommended point on axes of matplotlib. The numbers of
+    the front are left to `figure_of`, because their places depend on the size of the axes.
     """
     axes.set(xscale="log", xlabel=_label(study, study.cost), ylabel=_label(study, PSNR))
     groups = list(series(study))
@@ -225,8 +253,9 @@ def draw(axes: "Axes", study: Tradeoff) -> None:
 
 
 def series(study: Tradeoff) -> Iterator[Series]:
-    """Yield the points by style: a colour for each network, and for several boards a marker for
-    each.
+    """Yield the points of a study that can be plotted, grouped by colour and marker.
+
+    Each network has a colour. Each board has a marker, or each network if there is one board.
     """
     names: dict[str, int] = {}
     groups: dict[tuple[str, str], list[Measured]] = {}

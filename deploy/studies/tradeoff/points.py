@@ -47,12 +47,12 @@ HALOS_PX = (0, HALO_STEP_PX, 2 * HALO_STEP_PX)
 
 @dataclass(frozen=True)
 class Variant:
-    """A method in one precision.
+    """A method in one precision, whose quality is measured once for all devices.
 
     Attributes:
-        method: its name without the precision.
-        precision: float32 or INT8.
-        network: in that precision; None for a method without a network.
+        method: the name of the method without the precision.
+        precision: "float32" or "INT8".
+        network: the network in this precision; None for a method without a network.
     """
 
     method: str
@@ -61,22 +61,24 @@ class Variant:
 
     @property
     def name(self) -> str:
-        """The name in tables."""
+        """The name in tables: the method, and the precision of a network."""
         return f"{self.method} {self.precision}" if self.network else self.method
 
 
 @dataclass(frozen=True)
 class Point:
-    """A variant on one device.
+    """An operating point: a method in one precision on one device, in tiles of one size.
 
     Attributes:
         variant: the method and its precision.
-        board: the target, None for this machine alone.
-        dpu: the configuration of the board's DPU; None for its processor.
-        tile_px: side of a tile.
-        halo_px: context around a tile; None for the receptive radius, whose seams are exact.
-        reason: the reason why there are no figures of a board.
-        refused_by: the board whose DPU refuses the network, for that reason; empty if none does.
+        board: the board that runs the method; None if it is measured on this machine alone.
+        dpu: the configuration of the board's DPU; None if the board's processor runs the method.
+        tile_px: the side of a tile.
+        halo_px: the context that is read around the retained part of a tile; None for the network's
+            receptive radius, with which seams are exact.
+        reason: the reason why there are no figures of a board; empty if there are some.
+        refused_by: the name of the board whose DPU cannot run the network, as `reason` states;
+            empty if no board refused it.
     """
 
     variant: Variant
@@ -106,13 +108,19 @@ def network_variants(
     sensor: Sensor,
     make_int8: Callable[[Network], Network],
 ) -> list[Variant]:
-    """Return the networks in float32 and INT8. Shipped ones are conditioned on the sensor's
-    profile, and INT8 files are used as they are.
+    """Load the networks that a study compares, each in float32 and in INT8.
+
+    Shipped networks are conditioned on the sensor. A file in INT8 is compared in INT8 alone, and a
+    float network that cannot be quantised in float32 alone.
 
     Args:
         networks: shipped names, ONNX and safetensors files, or networks in memory.
         sensor: the sensor that acquires the images.
-        make_int8: quantises a float network.
+        make_int8: returns the INT8 network of a float one.
+
+    Raises:
+        OptionError: two networks have one name, a name is unknown, or a network does not restore
+            one band in tiles of any size.
     """
     each = (_variants(network, sensor, make_int8) for network in networks)
     variants = list(chain.from_iterable(each))
@@ -164,13 +172,15 @@ def _variants(
 def points_of(
     networks: Iterable[Variant], boards: Sequence[TargetProfile], whole: Swath
 ) -> list[Point]:
-    """Return the points at which networks, traditional pipelines and methods of other libraries are
-    compared.
+    """Return all operating points of a study, before they are measured.
+
+    Networks in INT8 run on the DPUs of the boards, traditional pipelines on the boards' processors,
+    and float networks and methods of other libraries on this machine alone.
 
     Args:
-        networks: in float32 and in INT8.
-        boards: targets with a DPU.
-        whole: the swath.
+        networks: the networks, each in float32 and in INT8.
+        boards: the boards, each with a DPU.
+        whole: the swath (the large image) whose time is predicted.
     """
     of_networks = (network_points(variant, boards, whole) for variant in networks)
     traditional = [Variant(f"traditional-{quality}") for quality in QUALITIES]
@@ -182,10 +192,17 @@ def points_of(
 
 
 def network_points(variant: Variant, boards: Sequence[TargetProfile], whole: Swath) -> list[Point]:
-    """Return the points at which a network is compared: in INT8 in each configuration of every
-    board, with more tiles in the default one.
+    """Return the operating points of one network.
 
-    Every board is treated in the same way, so that the order of the boards has no effect.
+    In INT8 there is a point for each configuration of every board's DPU, with the fastest tile. The
+    default configuration also has points with another tile and with smaller halos. In float32
+    there is one point on this machine. A board that refuses the network has one point with the
+    reason.
+
+    Args:
+        variant: the network in one precision.
+        boards: the boards, all of which are treated in the same way.
+        whole: the swath (the large image) whose time is predicted.
     """
     if variant.precision == FLOAT:
         return [Point(variant, reason=FLOAT_ON_DPU)]
@@ -217,8 +234,14 @@ def _on_board(variant: Variant, board: TargetProfile, swath: Swath) -> list[Poin
 
 
 def fastest_tile_px(variant: Variant, dpu: Dpu, whole: Swath) -> int:
-    """Return the tile with exact seams, no larger than the paper's, that has the shortest predicted
-    time for the swath.
+    """Return the side in pixels of the tile with the shortest predicted time for a swath.
+
+    Tiles have the halo with which seams are exact, and are at most as large as the paper's.
+
+    Args:
+        variant: an INT8 network.
+        dpu: the configuration of the DPU that runs the network.
+        whole: the swath (the large image).
     """
     radius = exact_halo_px(variant)
     # A tile has to be wider than its two halos.
@@ -231,13 +254,12 @@ def fastest_tile_px(variant: Variant, dpu: Dpu, whole: Swath) -> int:
 
 
 def dpu_latency(variant: Variant, dpu: Dpu, swath: Swath) -> Figure:
-    """Return the latency that the cost model predicts for an INT8 network and a swath in whole
-    tiles.
+    """Predict the seconds that a board needs for a swath, by the DPU's cost model.
 
     Args:
-        variant: the network.
-        dpu: the DPU that it runs on.
-        swath: with its tiles and their halo.
+        variant: an INT8 network.
+        dpu: the configuration of the DPU that runs the network.
+        swath: the large image, with the size and halo of its tiles. Whole tiles are counted.
     """
     placement = place(_graph(network_of_variant(variant), swath.tile_px), dpu)
     prediction = predict(placement, dpu, step_px=swath.step_px)
@@ -245,12 +267,14 @@ def dpu_latency(variant: Variant, dpu: Dpu, swath: Swath) -> Figure:
 
 
 def exact_halo_px(variant: Variant) -> int:
-    """Return the smallest halo in pixels at which a network's tiles have no seams."""
+    """Return the smallest halo in pixels with which the tiles of a variant's network have exact
+    seams: the network's receptive radius.
+    """
     return network_of_variant(variant).tiling.halo_px
 
 
 def network_of_variant(variant: Variant) -> Network:
-    """Return the network of a variant that has one."""
+    """Return the network of a variant. Call this only for a variant that has one."""
     return Network.load(variant.network)
 
 
@@ -274,13 +298,20 @@ STANDARD = "traditional-standard"
 def board_figures(
     point: Point, whole: Swath, slower: float | None = None, runs: float = 1.0
 ) -> dict[str, Figure]:
-    """Return the figures of a point's board, which are unavailable with a reason if it has none.
+    """Predict the figures of an operating point on its board for a swath.
 
     Args:
-        point: a network on a DPU, or a traditional pipeline on the board's processor.
-        whole: the swath.
-        slower: the time of a pipeline relative to STANDARD, measured on this machine.
-        runs: the mean number of runs of the network on a tile of the measured images.
+        point: the operating point: a network on a DPU, a traditional pipeline on the board's
+            processor, or a method on this machine alone.
+        whole: the swath (the large image).
+        slower: the time of a traditional pipeline over that of `STANDARD`, measured on this
+            machine; None if it is not known.
+        runs: the mean number of runs of the network on a tile of the measured images, one for each
+            exposure.
+
+    Returns:
+        The figures of `UNITS` by name. They are unavailable, with the reason, for a point without a
+        board or a stated time.
     """
     if point.dpu is not None:
         halo_px = exact_halo_px(point.variant) if point.halo_px is None else point.halo_px

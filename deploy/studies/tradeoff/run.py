@@ -53,18 +53,18 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Study:
-    """The settings of a study.
+    """The checked options of `tradeoff`.
 
     Attributes:
-        networks: shipped names, files, or networks in memory; float ones are quantised.
-        boards: the boards whose points are compared.
+        networks: shipped names, files, or networks in memory; float networks are also quantised.
+        boards: the boards that are compared, each named once.
         sensors: the sensors of the degraded and of the reference images.
-        scenes: folder of held-out scenes; None for drawn ones.
-        lpips: weights for LPIPS, or None.
-        calibration: folder of scenes to quantise networks on; None for drawn ones.
-        size: (width, height) of the swath in pixels.
-        budget: upper limits of costs.
-        need: limits of quality that must be reached.
+        scenes: the folder of scenes that no network was trained on; None draws scenes.
+        lpips: the file or folder of weights for LPIPS; None reads the path from the environment.
+        calibration: the folder of scenes on which float networks are quantised; None draws scenes.
+        size: width and height in pixels of the swath whose time is predicted.
+        budget: limits that the costs of the recommended point must keep.
+        need: limits that its quality must reach.
         seed: the seed of every random draw.
     """
 
@@ -100,7 +100,7 @@ class Study:
 
     @property
     def board_names(self) -> list[str]:
-        """The names of the boards."""
+        """The names of the boards, in the given order."""
         return [profile.name for profile in self.boards]
 
     @property
@@ -132,19 +132,33 @@ class Study:
 
 
 def benchmark_of(study: Study) -> tuple[Benchmark, list[str]]:
-    """Return the pairs that all methods are measured on, and remarks on them."""
+    """Simulate the pairs of images on which all methods of a study are measured.
+
+    Returns:
+        The images with their metrics, and sentences for the reader on how they were simulated.
+    """
     pairs, remarks = pairs_of_scenes(study.scenes, *study.sensors, study.seed)
     return Benchmark(pairs, *study.sensors, study.lpips, study.seed), remarks
 
 
 def points_for(study: Study, quantize: Callable[[Network], Network]) -> list[Point]:
-    """Return the points of a study; `quantize` returns the INT8 network of a float one."""
+    """Return the operating points of a study, before they are measured.
+
+    Args:
+        study: the options.
+        quantize: returns the INT8 network of a float one, or raises ModelError.
+    """
     variants = network_variants(study.networks, study.sensors[0], quantize)
     return points_of(variants, study.boards, Swath(*study.size))
 
 
 def run_tradeoff(study: Study) -> Tradeoff:
-    """Measure every point of a study, and recommend one."""
+    """Measure the quality of every operating point of a study, predict its time on the boards, and
+    recommend one point.
+
+    Raises:
+        BeersError: a network or an image cannot be loaded, or a network does not fit the study.
+    """
     # The digests are those of the files that are measured.
     inputs = study.inputs
     quantize = partial(
@@ -165,7 +179,11 @@ def run_tradeoff(study: Study) -> Tradeoff:
 
 
 def require_quantizable(network: Network) -> Network:
-    """Return a float network; raise ModelError if `quantize` refuses it."""
+    """Return a float network in place of its INT8 one, for a preview without quantising.
+
+    Raises:
+        ModelError: `quantize` would refuse the network.
+    """
     reason = refusal(network.model)
     if reason:
         raise ModelError(reason)
@@ -177,7 +195,13 @@ PREVIEW_RUNS = 3
 
 
 def preview(study: Study) -> Table:
-    """Return the planned measurements and an estimate of their duration, from a crop timed here."""
+    """Return what a study would measure, and an estimate of its duration on this machine.
+
+    Every method is timed on a small crop of the first image, and the time is scaled by the pixels.
+
+    Returns:
+        A table of one row: the numbers of points, methods and images, and the time in seconds.
+    """
     benchmark, _ = benchmark_of(study)
     # A float network stands for its INT8 one, because quantising would take too long here.
     points = points_for(study, require_quantizable)
@@ -220,13 +244,14 @@ def weigh(
     asked: advice.Question,
     remarks: Sequence[str] = (),
 ) -> Tradeoff:
-    """Find the front, the recommendation, and the best point of each board.
+    """Compare measured operating points: find the front of quality against cost, the recommended
+    point, and the best point of each board.
 
     Args:
-        points: the points of all boards, and published runs.
-        boards: their names.
-        asked: budget and need.
-        remarks: on the study.
+        points: the measured points of all boards, and published runs.
+        boards: the names of the boards.
+        asked: the budget and the need.
+        remarks: sentences for the reader on how the points were measured.
     """
     cost = asked.cost(points)
     best, line = advice.recommend(points, asked)
@@ -261,7 +286,7 @@ def _measured(
     benchmark: Benchmark,
     swath: Swath,
 ) -> list[Measured]:
-    """Return every point with its figures."""
+    """Measure quality and time here of every point, and predict its figures on the board."""
     methods = _methods([point.variant for point in points], benchmark)
     results = list[Measured]()
     # Points of several boards may cut the images alike.
