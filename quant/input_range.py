@@ -80,8 +80,10 @@ def require_ranges(ranges: Iterable[tuple[float, ...]]) -> None:
 
 
 def is_range(low: float, high: float) -> bool:
-    """Return True if `low` < `high` and the larger absolute value of the two is within SIZES, the
-    smallest and the largest size that a range may have.
+    """Return True if two numbers can be the ends of a channel's input range.
+
+    The lower end must be below the higher one, and the larger absolute value of the two must be
+    within SIZES.
     """
     # NaN fails every comparison, so it is refused as well.
     return low < high and SIZES[0] <= largest_size(low, high) <= SIZES[1]
@@ -141,7 +143,7 @@ def ranges_of_result(result: np.ndarray, image: np.ndarray, ranges: Ranges) -> R
 
 
 def share_within(values: np.ndarray, low: float, high: float) -> float:
-    """Return the share of the values from `low` to `high`."""
+    """Return the share of the values, in [0, 1], that lie from `low` to `high`, both included."""
     return float(((values >= low) & (values <= high)).mean())
 
 
@@ -186,7 +188,12 @@ def _ends(values: np.ndarray, ranges: Ranges) -> np.ndarray:
 
 
 def in_words(ranges: Ranges) -> str:
-    """Return ranges as text for messages, once if all are equal."""
+    """Format ranges as text for messages, such as "-1 to 1".
+
+    Args:
+        ranges: the ranges of a network's channels, at least one. They are stated once if all are
+            equal.
+    """
     return ", ".join(
         f"{low:g} to {high:g}" for low, high in (ranges if len(set(ranges)) > 1 else ranges[:1])
     )

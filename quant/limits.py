@@ -82,14 +82,20 @@ def limits_of(
     source: "Limits | Mapping[str, float] | str | os.PathLike[str] | None",
     max_mae: float | None = None,
 ) -> Limits:
-    """Read the limits of a TOML file or a mapping; limits that are missing have their defaults.
+    """Read the limits of the gate from a TOML file or a mapping; limits that are missing have their
+    defaults.
 
     Args:
-        source: limits, a mapping or a TOML file such as `mae = 0.0007`; the defaults if None.
-        max_mae: overrides the limit of the MAE.
+        source: limits by name, or a TOML file with lines such as `mae = 0.0007`. A `Limits` is used
+            as it is, and None has the defaults.
+        max_mae: overrides the limit of the mean absolute error, as a share of full scale.
+
+    Returns:
+        The limits, each of which a broken network would exceed.
 
     Raises:
-        OptionError: no limits, unknown ones, or some that no network breaks.
+        OptionError: the source is empty or cannot be read, names an unknown limit, or has a value
+            so wide that even a network that returns a black image would pass.
     """
     where = "`limits`"
     values: Mapping[str, object]
@@ -149,14 +155,17 @@ def judge(
     baseline_mae: float | None = None,
     shares: Mapping[str, float] | None = None,
 ) -> list[Check]:
-    """Check every limit that is set.
+    """Compare the measured effect of INT8 with every limit that is set.
 
     Args:
-        result: the measured effect of INT8.
+        result: the measured differences between the INT8 and the float network.
         limits: the largest values allowed.
-        baseline_mae: the MAE of an earlier gate, if there is a baseline.
-        shares: for each layer the share of its results at the ends of 8 bits. With None it is not
-            checked; without 8-bit tensors its limit is not met.
+        baseline_mae: the MAE that an earlier run of the gate stored, if there is a baseline.
+        shares: for each layer, by name, the share of its results at the ends of 8 bits. With None
+            this is not checked. If it is empty, because no tensor has 8 bits, the limit is not met.
+
+    Returns:
+        One check for each limit that is set, with the measured value and the limit.
     """
     figures: list[tuple[str, float, float | None, str, str]] = [
         ("MAE", result.mae, limits.mae, "of full scale", ""),

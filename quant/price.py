@@ -61,12 +61,12 @@ STEPS: Mapping[str, tuple[tuple[int, ...] | None, bool, bool]] = {
 
 @dataclass(frozen=True)
 class Grid:
-    """A uniform quantization grid: the multiples of `scale` from `low` to `high` times it.
+    """The values that a rounded tensor may have: scale times each integer from `low` to `high`.
 
     Attributes:
-        scale: distance between neighbouring values of the grid, in the tensor's unit.
-        low: the smallest multiple, or minus infinity if the grid has no lower end.
-        high: the largest multiple, or infinity if the grid has no upper end.
+        scale: distance between neighbouring values, in the tensor's unit.
+        low: the smallest integer, or minus infinity if the grid has no lower end.
+        high: the largest integer, or infinity if the grid has no upper end.
     """
 
     scale: float
@@ -76,27 +76,29 @@ class Grid:
 
 @dataclass(frozen=True)
 class Cost:
-    """The loss of a step, as the mean over the samples.
+    """The loss of a network with some restrictions of a DPU against the float network, as mean over
+    samples.
 
     Attributes:
         mae: mean absolute difference from the float network's result, in shares of the input's
             range.
-        drop_db: PSNR of the float network less that of the step, in dB against the references; NaN
-            without references.
+        drop_db: PSNR of the float network less that of the restricted one, in dB against the
+            references; NaN without references.
     """
 
     mae: float
     drop_db: float
 
     def beyond(self, before: "Cost", source: str) -> Figure:
-        """Return the loss that was added to that of another step.
+        """Return the loss that one more restriction adds to the loss before it, as a figure.
 
         Args:
-            before: the loss of the step before this one.
+            before: the loss with the restrictions before this one.
             source: how both were measured, for the figure.
 
         Returns:
-            The added loss in dB if both have references, else the added mean absolute difference.
+            The added loss in dB if both have references, else the added mean absolute difference as
+            a share of full scale.
         """
         if math.isfinite(self.drop_db) and math.isfinite(before.drop_db):
             return measured(self.drop_db - before.drop_db, "dB", source)
@@ -105,13 +107,15 @@ class Cost:
 
 @dataclass(frozen=True)
 class Measured:
-    """Samples that steps are measured on.
+    """Samples on which restrictions of a DPU are measured, with the float network's results for
+    them.
 
     Attributes:
-        pairs: the pairs of an image and its reference, which may be empty.
-        floats: results of the float network.
-        ranges: the smallest and the largest value of each of its tensors, and 0.
-        host_part: the host's part.
+        pairs: the pairs of an image and its reference. A reference may be an empty array.
+        floats: the float network's result for each image.
+        ranges: the smallest and the largest value of each tensor of the float network by name, over
+            all samples and 0.
+        host_part: the host's pre- and post-processing, which all steps share.
     """
 
     pairs: Sequence[Pair]
@@ -234,15 +238,16 @@ class Measured:
 
 
 def price_rows(result: Quantized, held_out: Patches) -> list[Row]:
-    """Return a row for the loss of each step, and one for the cost of clipping in the last.
+    """Measure the loss that each restriction of a DPU adds, from the float network to INT8, as
+    table rows.
 
     Args:
-        result: the INT8 network, with its float one.
+        result: the quantised network, which also holds the float one.
         held_out: samples that are held out from calibration. At most SAMPLES of them are measured.
 
     Returns:
-        Rows of the table "price", in the order of the steps. "price" is the loss that a step adds
-        to the step before it.
+        Rows of the table "price": one for each step of the module in order, and one for clipping in
+        the last step. Their figure "price" is the loss that a step adds to the step before it.
     """
     samples = Measured.of(result, list(islice(held_out.pairs, SAMPLES)))
     graph = result.network.graph

@@ -47,8 +47,11 @@ VALUE_BYTES: dict[int, int] = {
 def check_content(model: onnx.ModelProto, where: str) -> None:
     """Raise ModelError if a model does not hold what it states.
 
+    It checks that there are an input and an output, that no stated size is absurd, and that each
+    weight has as many finite values as its size states.
+
     Args:
-        model: to be checked.
+        model: the parsed file, not checked before.
         where: name of the network for the message, such as "a.onnx" or "the float network".
     """
     graph = model.graph
@@ -88,11 +91,12 @@ def contradictions(where: str) -> Iterator[None]:
 
 
 def check_size(name: str, sizes: Iterable[float], where: str) -> None:
-    """Raise ModelError if a file states an absurd size of a tensor.
+    """Raise ModelError if a tensor that a file only sizes would have more than VALUES values, or
+    too many axes.
 
     Args:
         name: the name of the tensor, for the message.
-        sizes: its sizes; 0 and -1 are open sizes.
+        sizes: the sizes that the file states; 0 and -1 mean a free size.
         where: name of the network, for the message.
     """
     sizes = list(sizes)
@@ -111,9 +115,10 @@ def times(sizes: Iterable[float]) -> str:
 
 
 def held_tensors(graph: onnx.GraphProto) -> Iterator[TensorProto]:
-    """Yield every constant, including those of nested graphs.
+    """Yield every constant tensor of a graph: initializers and attributes of nodes, nested graphs
+    included.
 
-    protobuf itself limits their nesting to a hundred.
+    protobuf itself limits the nesting to a hundred.
     """
     yield from graph.initializer
     for sparse in graph.sparse_initializer:
