@@ -89,10 +89,14 @@ def _core_file(
 
 
 def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Convert an INT8 file for onnxruntime to the board's encoding of the same integers.
+    """Return an INT8 file that was written for onnxruntime in the board's encoding of the same
+    integers.
 
-    Operators that onnxruntime needs several nodes for, such as a transposed convolution, become
-    single operators. Any other model is returned unchanged.
+    The checker reads networks this way, because operators for which onnxruntime needs several
+    nodes, such as a transposed convolution, are then single operators.
+
+    Args:
+        model: a model. One that does not describe its integers is returned unchanged.
     """
     if KEY not in metadata(model):
         return model
@@ -102,7 +106,9 @@ def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 class BoardWriter(GraphWriter):
-    """Writes tensors as the board's flow reads them: quantised to int8, then dequantised."""
+    """A graph under construction for the board's file, in which each tensor is quantised to int8,
+    then dequantised.
+    """
 
     def scale(self, tensor: str, frac_bits: int) -> list[str]:  # noqa: ARG002 - tensors of one scale share it here
         """Add the scale 2^-frac_bits and the zero point 0 of a tensor to the file.
@@ -118,7 +124,13 @@ class BoardWriter(GraphWriter):
         return [self.unit(frac_bits), self.constant("zero_point", np.array(0, np.int8))]
 
     def quantized(self, output: str, source: str, frac_bits: int) -> None:
-        """Quantise and dequantise an activation."""
+        """Write the nodes that quantise an activation to int8 and dequantise it again.
+
+        Args:
+            output: the name of the dequantised tensor.
+            source: the name of the tensor in float.
+            frac_bits: the number of fractional bits of its scale.
+        """
         middle = self.node(
             "QuantizeLinear", f"{source}.int8", [source, *self.scale(source, frac_bits)]
         )
@@ -195,7 +207,12 @@ OF_NPU = "an NPU, because its compiler accepts fixed sizes only"
 
 
 def required_tile(tile_px: int | None, use: str) -> int:
-    """Return the side of the tile, or raise OptionError if there is none: `use` needs one."""
+    """Return the side of a tile in pixels, or raise OptionError if the user gave none.
+
+    Args:
+        tile_px: the side, or None.
+        use: what needs a tile of fixed size, for the message.
+    """
     if tile_px is None:
         raise OptionError(f"`tile` must be given for {use}. Give a side in pixels, such as 640.")
     return tile_px
@@ -240,8 +257,11 @@ class _PairWriter(BoardWriter):
 
 
 def save_config(core: Path, device: str) -> Path:
-    """Write the file that AMD's compiler reads next to a core: the device, and defaults for the
-    rest.
+    """Write the configuration that AMD's compiler reads next to a VINT8 file, and return its path.
+
+    Args:
+        core: the path of the VINT8 file, in whose folder the configuration is written.
+        device: the name of the device in AMD's words. All other settings are defaults.
     """
     names = ("init", "vaiml_partition")
     vaiml = {"device": device, "optimize_level": 2}

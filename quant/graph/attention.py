@@ -20,15 +20,16 @@ BETWEEN = {"Conv", "LeakyRelu", "PRelu", "Relu"}
 
 
 def shrinking(graph: OnnxGraph, node: Node) -> list[Node]:
-    """Return the nodes in front of a Resize that attention has, the strided convolution first.
+    """Return the nodes of a spatial attention that reduce its map, in front of the Resize that
+    enlarges it.
 
     Args:
         graph: the graph that the node belongs to.
-        node: any node.
+        node: any node; only a Resize can be part of an attention.
 
     Returns:
-        The convolution of stride 2, the maximum of stride 3 and the nodes in front of the Resize;
-        empty if the node is something else.
+        In order: the convolution of stride 2, the maximum of stride 3, and the nodes between that
+        and the Resize. The list is empty if the node is no Resize of an attention.
     """
     nodes: list[Node] = []
     writer = _writer(graph, node.inputs[0]) if node.op_type == "Resize" else None

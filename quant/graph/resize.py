@@ -26,10 +26,15 @@ ROUNDINGS: dict[str, Callable[[float], int]] = {
 
 @dataclass(frozen=True)
 class Resizing:
-    """A Resize, or an Upsample of older opsets, with ONNX's defaults filled in.
+    """An enlargement as a Resize node states it (or an Upsample of older opsets), with ONNX's
+    defaults filled in.
 
-    `factors` are those of N, C, H and W; they are empty if they are computed, or if a size is
-    stated.
+    Attributes:
+        factors: the factors of N, C, H and W; empty if other nodes compute them, or if a size is
+            stated instead.
+        mode: the interpolation, in ONNX's words: "nearest", "linear" or "cubic".
+        where: ONNX's `coordinate_transformation_mode`, the position of a pixel in the source.
+        rounding: ONNX's `nearest_mode`, how a position is rounded to a pixel.
     """
 
     factors: tuple[float, ...]

@@ -26,12 +26,14 @@ Constants = dict[str, object]
 
 @dataclass(frozen=True)
 class Plain:
-    """One copy, which is the value. The decodings of several copies derive from this class.
+    """Decodes a result that the core writes once. The decodings of several copies derive from this
+    class.
 
     Attributes:
-        offsets: (windows, C) numbers that the host adds to each of the last copies, in the result's
-            unit.
-        finer_bits: fractional bits that a fine copy has in addition to those of a single one.
+        offsets: (windows, C) the numbers that the host adds to each of the last copies, in the
+            result's unit; empty if it adds none.
+        finer_bits: the number of fractional bits that a fine copy has in addition to those of a
+            single copy.
     """
 
     offsets: Offsets = ()
@@ -39,40 +41,68 @@ class Plain:
 
     @property
     def gains(self) -> tuple[int, ...]:
-        """The factor by which the host multiplies each copy that the last convolution writes."""
+        """The factor by which the host multiplies each copy that the last convolution writes, in
+        order.
+        """
         return (1,)
 
     @property
     def copies(self) -> int:
-        """The number of copies of each channel that the core writes."""
+        """The number of times that the core writes each channel of the result."""
         return len(self.gains)
 
     def never_replaced(self, outputs: int) -> slice:  # noqa: ARG002 - other decodings use it
-        """Return which channels no other copy replaces, so that a clipped value there is lost."""
+        """Return the channels of the core's result that no other copy replaces where they are
+        clipped.
+
+        A clipped value there is lost, so that the gate counts it as saturated.
+
+        Args:
+            outputs: the number of decoded channels.
+        """
         return slice(None)
 
     def with_bias_errors(self, errors: np.ndarray) -> "Plain":  # noqa: ARG002 - as above
-        """Return a decoding that adds errors of int8 biases (copies C,), if it adds offsets."""
+        """Return a decoding that adds the rounding errors of the last biases to its offsets, if it
+        has offsets.
+
+        Args:
+            errors: (copies C,) the float bias less the int8 bias of each channel that the core
+                writes, in the result's unit.
+        """
         return self
 
     def decode(self, result: np.ndarray, scale: float) -> np.ndarray:  # noqa: ARG002 - as above
-        """Decode a result (N, copies C, H, W) float32, multiples of `scale`, as (N, C, H, W)."""
+        """Combine the copies that the core writes of each channel to one value.
+
+        Args:
+            result: (N, copies C, H, W) float32, multiples of `scale`.
+            scale: the real value of the integer 1 of the result.
+
+        Returns:
+            The decoded values, (N, C, H, W) float32.
+        """
         return result
 
     def write(self, w: HostWriter, feeds: list[str], outputs: int, scale: float) -> None:  # noqa: ARG002 - as above
-        """Write the nodes that decode a result as `DECODED`.
+        """Write the ONNX nodes that decode a result as the tensor DECODED.
 
         Args:
-            w: gets the nodes.
-            feeds: the names of the result in uint8, of its scale and of its zero point.
+            w: the writer that receives the nodes.
+            feeds: the names of three tensors: the result in uint8, its scale and its zero point.
             outputs: the number of decoded channels.
-            scale: the value of the scale that `feeds` names, from which other decodings compute
-                their limits.
+            scale: the number in the second tensor. Decodings of several copies compute their limits
+                from it.
         """
         w.node("DequantizeLinear", DECODED, feeds)
 
     def constants(self, scale: float) -> Constants:  # noqa: ARG002 - as above
-        """Return the constants that a kit's `host.py` decodes with."""
+        """Return the constants that a kit's `host.py` needs to decode a result, by their names
+        there.
+
+        Args:
+            scale: the real value of the integer 1 of the result.
+        """
         return {"decoding": "plain"}
 
 
@@ -90,11 +120,13 @@ class DualRange(Plain):
 
     @property
     def gains(self) -> tuple[int, ...]:
-        """The factor by which the host multiplies the fine and the coarse copy."""
+        """The factors by which the host multiplies the fine and the coarse copy: 1 and GAIN."""
         return (1, GAIN)
 
     def never_replaced(self, outputs: int) -> slice:
-        """Return all channels behind the fine copy."""
+        """Return all channels behind the fine copy, which is the only one that another copy
+        replaces.
+        """
         return slice(outputs, None)
 
     def decode(self, result: np.ndarray, scale: float) -> np.ndarray:
@@ -128,21 +160,33 @@ class DualRange(Plain):
 
 @dataclass(frozen=True)
 class OffsetWindows(Plain):
-    """A coarse copy, then fine ones minus one offset each: windows side by side over the range."""
+    """A decoding of one coarse copy and several fine ones, each of which covers a part of the
+    result's range.
+
+    Such a part is called a window. The core writes a fine copy less the middle of its window, and
+    the host adds the middle again: the copy's offset.
+    """
 
     finer_bits = GAIN.bit_length() - 1
 
     @property
     def gains(self) -> tuple[int, ...]:
-        """The factor by which the host multiplies each copy."""
+        """The factors by which the host multiplies each copy: GAIN for the coarse one, which comes
+        first, then 1.
+        """
         return (GAIN, *[1] * len(self.offsets))
 
     def never_replaced(self, outputs: int) -> slice:
-        """Return the channels of the coarse copy."""
+        """Return the channels of the coarse copy, which come first."""
         return slice(outputs)
 
     def with_bias_errors(self, errors: np.ndarray) -> "OffsetWindows":
-        """Return a decoding with the errors of the fine copies in its offsets."""
+        """Return a decoding whose offsets include the rounding errors of the fine copies' biases.
+
+        Args:
+            errors: (copies C,) the float bias less the int8 bias of each channel that the core
+                writes, in the result's unit.
+        """
         # The coarse copy comes first, and the host adds no offset to it.
         fine = errors.reshape(self.copies, -1)[1:]
         return OffsetWindows(tuple(map(tuple, (np.array(self.offsets) + fine).tolist())))
@@ -188,10 +232,14 @@ class OffsetWindows(Plain):
 
 @dataclass(frozen=True)
 class BankSum(DualRange):
-    """The correction in dual range, plus the sum of copies of a bank's analytic restoration.
+    """A decoding for a network behind a sensor's filters: its correction plus the analytic
+    restoration.
+
+    The analytic restoration is the one that the filters compute in closed form (`model.bank`). The
+    core writes it in ANALYTIC_COPIES copies, behind a fine and a coarse copy of the correction.
 
     Attributes:
-        coarse_copies: 1 if the last analytic copy is coarse by `WIDE`, for values at which the
+        coarse_copies: 1 if the last analytic copy is coarser by `WIDE`, for values at which the
             others are clipped, else 0.
     """
 
@@ -200,12 +248,14 @@ class BankSum(DualRange):
 
     @property
     def copies(self) -> int:
-        """The number of copies of each channel that the core writes."""
+        """The number of copies of each channel that the core writes: two of the correction, then
+        the analytic ones.
+        """
         return len(self.gains) + ANALYTIC_COPIES
 
     @property
     def fine_copies(self) -> int:
-        """The number of fine analytic copies."""
+        """The number of fine copies of the analytic restoration."""
         return ANALYTIC_COPIES - self.coarse_copies
 
     def _fine_gain(self, scale: float) -> float:

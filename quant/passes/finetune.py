@@ -64,13 +64,13 @@ JUDGING = 48
 
 @dataclass(frozen=True)
 class Pace:
-    """How far the steps of a round go.
+    """The size of the gradient steps in one round of fine-tuning.
 
     Attributes:
-        share: the share of the highest rate.
-        by_tensor: whether a gradient is divided by the root mean square of its whole tensor, and
-            not number by number, as Adam does. Number by number, small gradients that are mostly
-            noise move their numbers as far as others. Once all these cross their rounding
+        share: the learning rate at the start of the round, as a share of the highest rate.
+        by_tensor: True divides a gradient by the root mean square of its whole tensor; False
+            divides each number's gradient by its own, as Adam does. Then small gradients that are
+            mostly noise move their numbers as far as others. Once all these cross their rounding
             thresholds, the error multiplies: a network that INT8 harms little only gets worse.
     """
 
@@ -155,16 +155,16 @@ class Sample:
 def finetune(
     core: IntCore, full: Graph, tuning: Tuning, shifts: Shifts = SHIFTS
 ) -> tuple[IntCore, int]:
-    """Train the integers and scales of a core.
+    """Train the integers of a core, and change its scales where that reduces the error.
 
     Args:
-        core: the core to start from.
-        full: the float network that reads all planes.
+        core: the integer core to start from.
+        full: the float graph that reads the int8 planes of an image, before equalization.
         tuning: the training pairs, the number of steps and the learning rate.
-        shifts: the shift windows of the target.
+        shifts: the smallest and largest shifts that the target allows.
 
     Returns:
-        The core that erred least on held-out pairs, which is `core` itself if training finds
+        The core with the least error on held-out pairs, which is `core` itself if training finds
         nothing better, and the number of steps taken.
 
     Raises:
