@@ -45,15 +45,17 @@ Shape = tuple[int, ...]
 
 
 class LayerWriter:
-    """Collects the C text of operations, and the definitions that it needs.
+    """Collects the C code of a core's operations: constants, and calls of the functions in
+    `kernels/`.
 
     Attributes:
-        constants: definitions of constants, each after a comment on its layer.
-        calls: statements, in order.
-        kernels: files in `kernels/`, each named by the function that is called.
+        constants: C definitions of constants, each behind a comment on its layer.
+        calls: C statements, in order.
+        kernels: the names of the C files in `kernels/` that are needed, each of which defines the
+            function of that name.
         constant_bytes: the size of all weights, biases and tables.
-        line_length: the number of values of the longest `line` in `kernels/convolve.c`.
-        weights_length: the largest number of values of `weights` there.
+        line_length: the number of values that the buffer `line` of `kernels/convolve.c` needs.
+        weights_length: the number of values that the buffer `weights` there needs.
     """
 
     def __init__(self, core: IntCore, shapes: Mapping[str, Shape]) -> None:
@@ -156,16 +158,17 @@ class LayerWriter:
         activation: Activation = Activation.none,
         frac_bits: int = 0,
     ) -> str:
-        """Return the C initializer of the rounding by which sums become the result of an operation.
+        """Return the C initializer of the rounding that turns the sums of an operation into its
+        result.
 
         Args:
-            op: the operation, for the message.
-            shift: right shift from the unit of the sums to that of the result. A negative one
-                shifts left.
-            bits: the bits without the sign that the largest possible sum needs.
-            activation: applied to the sums.
-            frac_bits: the fractional bits of the sums, in which the limits of the activation are
-                expressed.
+            op: the operation, whose name an error states.
+            shift: the right shift in bits from the scale of the sums to that of the result. A
+                negative one shifts left.
+            bits: the number of bits, without the sign, that no sum exceeds.
+            activation: the activation that is applied to the sums.
+            frac_bits: the number of fractional bits of the sums, in which limits of the activation
+                are expressed; only ReLU6 needs it.
 
         Returns:
             The initializer of a `struct rounding` in C.
@@ -190,7 +193,7 @@ class LayerWriter:
 
 
 def plain(name: str) -> str:
-    """Return a name from a file as text that cannot end a comment of C."""
+    """Replace what could end a C comment in a name from a file, and return the text."""
     return "".join(c if c.isascii() and (c.isalnum() or c in "._- ,:") else "_" for c in name)[:200]
 
 

@@ -364,8 +364,8 @@ def encoding_faults(model: onnx.ModelProto) -> list[str] | None:
     The file is written again from the description, and each node and constant must be the same.
 
     Returns:
-        A sentence for each fault; empty if there is none. None for a file that neither describes
-        its integers nor states that `quantize` wrote it.
+        A text for each fault, such as "constant conv1.weight"; empty if there is none. None for a
+        file that neither describes its integers nor states that `quantize` wrote it.
     """
     about = metadata(model)
     if KEY not in about and about.get("precision") != LEGAL:

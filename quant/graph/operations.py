@@ -341,8 +341,8 @@ def read_planes(graph: Graph, full_scale: np.ndarray | None = None) -> Graph:
     """Let the convolutions that read an image read the int8 planes instead, which the host encodes
     it in.
 
-    The weights of each plane are those of the image times the plane's share of the value. The
-    planes are read as multiples q * 2^-7.
+    The planes are read as multiples q * 2^-7. In float the coarse plane and its remainder carry the
+    value, and the weights of the third plane are zeros: it only makes the weights finer in INT8.
 
     Args:
         graph: a float graph that reads the image, by convolutions alone.
