@@ -433,7 +433,17 @@ def shift_faults(core: IntCore, shifts: Shifts = SHIFTS) -> list[str]:
 def op_shifts(
     op: IntConv | Op, frac_bits: Mapping[str, int], shifts: Shifts
 ) -> list[tuple[str, int, tuple[int, int]]]:
-    """Return (name, value, window) of each shift that an operation needs."""
+    """List the shifts that an operation needs, because its tensors have different scales.
+
+    Args:
+        op: an operation of a core.
+        frac_bits: the number of fractional bits of each tensor by its name.
+        shifts: the smallest and largest shifts that the target allows.
+
+    Returns:
+        For each shift its name, such as "shift_cut"; its value in bits; and the smallest and the
+        largest value allowed.
+    """
     inputs = [frac_bits[i] for i in op.inputs]
     output = frac_bits[op.output]
     if isinstance(op, Add):

@@ -60,7 +60,7 @@ def opset_of(model: ModelProto) -> int:
 
 
 def functions_of(model: ModelProto) -> Functions:
-    """Return domain and name of each function that a file defines."""
+    """Return domain and name of each function that a file itself defines from ONNX's operators."""
     return {(function.domain, function.name) for function in model.functions}
 
 

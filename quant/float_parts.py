@@ -62,10 +62,17 @@ def float_layers_check(model: onnx.ModelProto) -> Check:
 
 
 def float_note(model: onnx.ModelProto) -> list[str]:
-    """Return a note that names the float operators of another quantiser's file.
+    """Return a note for the user that names the operators which another quantiser's file computes
+    in float.
 
-    In a file of this project they are the host part, which `encoding_faults` compares with the
-    integers node by node.
+    A file of this project gets none, because its float operators are the host part, which
+    `encoding_faults` compares node by node.
+
+    Args:
+        model: an INT8 network.
+
+    Returns:
+        A list of one sentence, or an empty list.
     """
     try:
         read_core(model)

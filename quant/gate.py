@@ -31,12 +31,13 @@ SCALE = "of full scale"
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric by which a user judges results.
+    """A figure by which a user judges results, such as SSIM.
 
     Attributes:
         unit: the unit of the figure.
-        larger_is_better: whether a larger value is better.
-        value: function of a result (1, C, H, W) and its reference of the same shape.
+        larger_is_better: True if a larger value is better.
+        value: function of a result (1, C, H, W) and its reference of the same shape, both in shares
+            of full scale.
     """
 
     unit: str

@@ -24,7 +24,9 @@ MAE_GROWTH = 1.05
 
 @dataclass(frozen=True)
 class Limits:
-    """The largest values allowed; None for no limit. Differences and shares in [0, 1], PSNRs in dB.
+    """The limits of the gate: how much an INT8 network may differ from its float network at most.
+
+    None sets no limit. Differences and shares are in [0, 1], PSNRs in dB.
 
     Attributes:
         mae: mean absolute difference of INT8 from float. The default suits networks that change an
@@ -38,10 +40,10 @@ class Limits:
             the results.
         psnr_drop_db: PSNR lost against the reference.
         min_psnr_float_int8_db: smallest PSNR of INT8 against float.
-        metric_loss: loss of INT8 by the chosen metric.
+        metric_loss: loss of INT8 by the metric that the user chose, in the metric's unit.
         saturated: largest share of a layer's results at the ends of 8 bits.
-        mae_growth: MAE as a multiple of a stored baseline's; 1.05 if there is a baseline and no
-            such limit.
+        mae_growth: MAE as a multiple of the MAE of a stored baseline, which is an earlier run of
+            the gate; 1.05 if there is a baseline and this is None.
 
     Examples:
         >>> bd.Limits(psnr_drop_db=0.2).mae

@@ -143,7 +143,11 @@ def parse_onnx(
 
 
 def require_onnx_name(*paths: Path | None) -> None:
-    """Raise OptionError if the name of an output does not end in .onnx."""
+    """Raise OptionError if the name of a file to write does not end in .onnx.
+
+    Args:
+        paths: the files; None is skipped.
+    """
     for path in paths:
         if path is not None and path.suffix.lower() != ".onnx":
             raise OptionError(f"The name of the output must end in .onnx, got {path}.")
@@ -162,7 +166,7 @@ def save_onnx(model: onnx.ModelProto, path: Path) -> None:
 
 
 def metadata(model: onnx.ModelProto) -> dict[str, str]:
-    """Return the key-value pairs of a model's metadata."""
+    """Return the metadata that a model's file states, as text by key."""
     return {item.key: item.value for item in model.metadata_props}
 
 
@@ -239,7 +243,13 @@ class GraphWriter:
     def graph(
         self, name: str, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
     ) -> onnx.GraphProto:
-        """Build the ONNX graph of the nodes and constants collected so far."""
+        """Build the ONNX graph of the nodes and constants collected so far.
+
+        Args:
+            name: the name of the graph.
+            inputs: type and shape of each input, such as `image_info` describes them.
+            outputs: type and shape of each output.
+        """
         return onnx.helper.make_graph(
             self.nodes, name, inputs, outputs, list(self.weights.values())
         )
@@ -359,7 +369,9 @@ def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def is_quantized(model: onnx.ModelProto) -> bool:
-    """Return True if any node reads, writes or computes with quantised numbers."""
+    """Return True if a network is an INT8 one: any node reads, writes or computes with quantised
+    numbers.
+    """
     kinds = {node.op_type.lower() for node in model.graph.node}
     marks = ("qlinear", "quantizelinear", "integer")
     return any(mark in kind for kind, mark in product(kinds, marks))

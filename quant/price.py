@@ -125,10 +125,10 @@ class Measured:
 
     @classmethod
     def of(cls, result: Quantized, pairs: Sequence[Pair]) -> "Measured":
-        """Run the float network on the samples, and record its results and its tensors' ranges.
+        """Run the float network on samples, and record its results and the ranges of its tensors.
 
         Args:
-            result: the INT8 network, which knows the float one.
+            result: the quantised network, which also holds the float one.
             pairs: images (1, C, H, W) in the network's units, each with its reference or an empty
                 array.
         """

@@ -69,11 +69,15 @@ def check_content(model: onnx.ModelProto, where: str) -> None:
 
 @contextmanager
 def contradictions(where: str) -> Iterator[None]:
-    """Turn the errors that a malformed graph causes, by missing inputs or impossible sizes, into
-    ModelError.
+    """Turn errors within the block that a malformed graph causes into a ModelError.
+
+    Missing inputs and impossible sizes cause such errors, at any place that reads the graph.
 
     Args:
         where: name of the network for the message, such as "a.onnx" or "the float network".
+
+    Raises:
+        ModelError: one of the exceptions in DAMAGE was raised within the block.
     """
     try:
         yield
@@ -110,7 +114,7 @@ def check_size(name: str, sizes: Iterable[float], where: str) -> None:
 
 
 def times(sizes: Iterable[float]) -> str:
-    """Format sizes for a person: 64 x 3 x 3."""
+    """Format sizes as text for a message, such as "64 x 3 x 3"."""
     return " x ".join(f"{size:.12g}" for size in sizes)
 
 

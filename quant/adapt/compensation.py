@@ -76,8 +76,15 @@ class Networks:
         return weight, np.zeros(len(weight), np.float32) if bias is None else bias
 
     def set_weights(self, node: Node, weight: np.ndarray, bias: np.ndarray) -> None:
-        """Set the weights and bias of a convolution in graph and model, without changing those of
-        other nodes.
+        """Give a convolution of the adapted network weights and a bias of its own, in the graph and
+        the model.
+
+        Other nodes that read the same constants keep them.
+
+        Args:
+            node: the convolution.
+            weight: (O, I / groups, kh, kw) the new weights.
+            bias: (O,) the new bias.
         """
         numbers = {"weight": weight, "bias": bias}
         names = [self.graph.add_constant(f"{node.name}.{role}", v) for role, v in numbers.items()]

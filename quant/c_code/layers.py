@@ -101,15 +101,12 @@ class LayerWriter:
         _WRITERS[type(op)](self, op, f"_{number}")
 
     def array(self, kind: type[np.int8 | np.int32], name: str, values: np.ndarray) -> str:
-        """Define a constant array.
+        """Add the definition of a constant array, and return its name.
 
         Args:
-            kind: the type of its numbers.
-            name: its name in C, which must be unique in the file.
+            kind: the type of the numbers.
+            name: the name of the array in C, which must be unique in the file.
             values: integers of any shape, stored flat in C order.
-
-        Returns:
-            The name.
         """
         self.constant_bytes += values.size * np.dtype(kind).itemsize
         numbers = fill(
@@ -139,11 +136,13 @@ class LayerWriter:
         return f"&{name}"
 
     def call(self, function: str, first: str | int, op: IntConv | Op) -> None:
-        """Add the call of a kernel's function, and mark the kernel as used.
+        """Add the call of a C function for an operation, and mark the file of the function as
+        needed.
 
         Args:
-            function: name of the function, which is also that of the kernel's file.
-            first: its first argument in C, before the maps of the inputs and of the output.
+            function: the name of the function, which is also that of its file in `kernels/`.
+            first: the C expression of the function's first argument. The maps of the inputs and of
+                the output follow.
             op: the operation.
         """
         self.kernels.add(function)

@@ -38,16 +38,18 @@ from beers_deploy.quant.untrusted import contradictions
 def board_model(
     core: IntCore, about: dict[str, str], tile_px: int | None = None
 ) -> onnx.ModelProto:
-    """Write the core as a QDQ model from `planes` to `correction`.
+    """Write a core alone as an ONNX model with QuantizeLinear and DequantizeLinear (QDQ), which
+    board flows read.
 
-    `planes` are (N, C, H, W) float32, as q * 2^-7, and `correction` is (N, C', H', W') float32. Its
-    channels come in the copies that `HostPart.decode` combines to one value. If the host rearranges
-    pixels into channels first, the file records the number of pixels per place of the planes.
+    It reads the tensor `planes` (N, C, H, W) float32, multiples of 2^-7, and returns the tensor
+    `correction` (N, C', H', W') float32. The channels of that come in the copies that
+    `HostPart.decode` combines to one value. If the host rearranges pixels into channels first, the
+    metadata record the number of pixels per place of the planes.
 
     Args:
         core: the integer core.
-        about: metadata of the file.
-        tile_px: side of the image's tile; None for any size.
+        about: metadata of the file, by key.
+        tile_px: rows and columns of the image for which the file is fixed; None for any size.
     """
     writer = BoardWriter()
     writer.quantized("planes.dequantised", PLANES, core.frac_bits[PLANES])

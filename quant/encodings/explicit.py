@@ -53,14 +53,15 @@ def made_explicit(model: onnx.ModelProto, texts: dict[str, str]) -> onnx.ModelPr
 
 
 def implicit_parts(model: onnx.ModelProto) -> dict[str, list[str]]:
-    """Return the implicit parts of a model, by the rule of the profile that forbids them.
+    """List the parts of a model that the safety-related profile of ONNX does not allow to be
+    implicit.
 
     Args:
         model: any ONNX model.
 
     Returns:
-        For each rule the names of the nodes, tensors or operators that do not comply; an empty list
-        if all of them do.
+        A dict from a description of each rule to the names of the nodes, tensors or operators that
+        do not comply; an empty list if all comply.
     """
     graph = model.graph
     opset = opset_of(model)

@@ -28,7 +28,9 @@ SIXTH = 2731 / 2**14
 
 
 class Activation(StrEnum):
-    """An activation that follows an operation immediately, by ONNX's names."""
+    """An activation function that a DPU applies to the result of an operation; values are ONNX's
+    names.
+    """
 
     none = ""
     relu = "Relu"
@@ -70,19 +72,19 @@ _FUNCTIONS: Mapping[Activation, Callable[[np.ndarray], np.ndarray]] = {
 
 
 class Op(Protocol):
-    """The properties of every operation."""
+    """The properties that every operation of a graph has."""
 
     @property
     def name(self) -> str:
-        """Its name, which is unique."""
+        """The unique name of the operation."""
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The tensors it reads."""
+        """The names of the tensors that the operation reads."""
 
     @property
     def output(self) -> str:
-        """The tensor it writes."""
+        """The name of the tensor that the operation writes."""
 
 
 @runtime_checkable
@@ -128,7 +130,7 @@ class OneInput:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The tensors it reads."""
+        """The name of the one tensor that the operation reads, as a tuple."""
         return (self.input,)
 
 
@@ -180,7 +182,11 @@ class SeveralInputs:
 
 @dataclass(frozen=True)
 class Add(SeveralInputs):
-    """An element-wise sum of two tensors."""
+    """An element-wise sum of two tensors.
+
+    Attributes:
+        activation: the activation of the sum.
+    """
 
     activation: Activation = Activation.none
 
@@ -197,7 +203,12 @@ class Concat(SeveralInputs):
 
 @dataclass(frozen=True)
 class MaxPool(OneInput):
-    """The largest value of each window; padding never counts."""
+    """The largest value of each window of a map; padding never counts.
+
+    Attributes:
+        kernel: rows and columns of a window.
+        window: strides, pads and dilations.
+    """
 
     kernel: Pair
     window: Window = field(default_factory=Window)
@@ -205,8 +216,11 @@ class MaxPool(OneInput):
 
 @dataclass(frozen=True)
 class AveragePool(OneInput):
-    """The mean of each window, with padding counted as zeros; if `kernel` is None, the mean of the
-    whole image (global pooling).
+    """The mean of each window of a map, with padding counted as zeros.
+
+    Attributes:
+        kernel: rows and columns of a window; None for the mean of the whole map (global pooling).
+        window: strides, pads and dilations.
     """
 
     kernel: Pair | None
@@ -215,8 +229,11 @@ class AveragePool(OneInput):
 
 @dataclass(frozen=True)
 class Resize(OneInput):
-    """An enlargement of rows and columns by `factor`: nearest, or bilinear with
-    half-pixel centres.
+    """An enlargement of the rows and columns of a map.
+
+    Attributes:
+        factor: the factor of rows and columns.
+        bilinear: True interpolates bilinearly with half-pixel centres, False repeats pixels.
     """
 
     factor: int
@@ -263,7 +280,8 @@ class Shuffle(OneInput):
 class Pointwise(OneInput):
     """An activation as an operation of its own, which follows no convolution or add.
 
-    It is a function of each value, which the integer core stores as a table of 256 values.
+    Attributes:
+        activation: the function, which the integer core stores as a table of 256 values.
     """
 
     activation: Activation

@@ -147,20 +147,28 @@ class Integers:
         return self._constants.get(self.resolve(name))
 
     def weight(self, node: Node) -> np.ndarray | None:
-        """Return the weights of a convolution as stored; None if there are none, or if nodes
-        compute them.
+        """Return the weights of a convolution in the integers that the file stores.
+
+        Args:
+            node: a node of the file.
+
+        Returns:
+            The weights; None if the node has none, or if other nodes compute them.
         """
         place = WEIGHTS.get(node.op_type, len(node.inputs))
         return self.constant(node.inputs[place]) if place < len(node.inputs) else None
 
     def is_integer(self, node: Node) -> bool:
-        """Return True if the file computes this node on integers."""
+        """Return True if the file computes a node on integers, by integer kernels or between Q/DQ
+        nodes.
+        """
         return node.outputs[0] in self._int8 or node.outputs[0] in self._wide
 
     def is_notation(self, node: Node) -> bool:
-        """Return True if a node, such as a DequantizeLinear, is no operation of the network.
+        """Return True if a node computes nothing, and only defines how the integers that it reads
+        are interpreted.
 
-        Such a node only defines how the integers that it reads are to be interpreted.
+        A DequantizeLinear in front of an integer operation is an example.
         """
         result = node.outputs[0]
         if node.op_type == "DequantizeLinear" and result not in self._same:

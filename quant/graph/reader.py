@@ -102,7 +102,7 @@ def read_network(model: onnx.ModelProto) -> SplitNetwork:
 
 
 def refusal(model: onnx.ModelProto) -> str:
-    """Return a sentence on why a float network cannot be quantised; "" if it can."""
+    """Return a sentence for a user on why a float network cannot be quantised; "" if it can."""
     try:
         check_runnable(model, "the float network")
         read_network(model)

@@ -44,7 +44,12 @@ class Resizing:
 
     @classmethod
     def of(cls, node: Node, graph: OnnxGraph) -> "Resizing":
-        """Read the attributes and inputs of a node."""
+        """Read what a Resize or Upsample node states in its attributes and inputs.
+
+        Args:
+            node: the node.
+            graph: the graph that the node belongs to, which knows constant inputs.
+        """
         # Before opset 11 the factors are the second input, and places start at the corner.
         old = node.op_type == "Upsample" or len(node.inputs) == 2
         attribute = node.attributes.get
@@ -59,7 +64,11 @@ class Resizing:
         )
 
     def makes_blocks(self, factor: int) -> bool:
-        """Return True if each nearest pixel becomes a block of `factor` x `factor` pixels."""
+        """Return True if nearest interpolation turns each pixel into a block of `factor` x `factor`
+        pixels.
+
+        That depends on how positions are computed and rounded. The DPU repeats pixels in this way.
+        """
         if self.where not in PLACES or self.rounding not in ROUNDINGS:
             return False
         place = PLACES[self.where]

@@ -55,8 +55,14 @@ def graph_to_onnx(graph: Graph, outputs: list[str], channels: int = 3) -> onnx.M
 
 
 def onnx_weight(weight: np.ndarray, transposed: bool) -> np.ndarray:
-    """Return weights (O, I, kh, kw) in ONNX's order, which is (I, O, kh, kw) for a transposed
-    convolution.
+    """Return the weights of a convolution in the order of axes that ONNX requires.
+
+    Args:
+        weight: (O, I, kh, kw), with O the channels that are written.
+        transposed: True for a transposed convolution.
+
+    Returns:
+        (O, I, kh, kw), or (I, O, kh, kw) for a transposed convolution.
     """
     return np.ascontiguousarray(weight.swapaxes(0, 1)) if transposed else weight
 

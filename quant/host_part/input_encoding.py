@@ -76,11 +76,11 @@ class BitSlices:
         return np.concatenate(planes, axis=1).astype(np.int8)
 
     def write(self, w: HostWriter, image: str) -> None:
-        """Write the nodes that encode the tensor `image` as `ENCODED`.
+        """Write the ONNX nodes that encode an image, with the planes as the tensor ENCODED.
 
         Args:
-            w: gets the nodes.
-            image: name of a tensor (N, C, H, W) in shares of full scale.
+            w: the writer that receives the nodes.
+            image: the name of the image, a tensor (N, C, H, W) in shares of full scale.
         """
         max_dn = w.scalar("max_dn", MAX_DN)
         scaled = w.node("Mul", "host_front.scale", [image, max_dn])
@@ -143,11 +143,11 @@ class Direct:
         return np.clip(np.rint(image * 2.0**PLANES_FRAC_BITS), -128, 127).astype(np.int8)
 
     def write(self, w: HostWriter, image: str) -> None:
-        """Write the nodes that store the tensor `image` as `ENCODED`.
+        """Write the ONNX nodes that turn multiples of 1/128 into integers, as the tensor ENCODED.
 
         Args:
-            w: gets the nodes.
-            image: name of a tensor of multiples of 1/128.
+            w: the writer that receives the nodes.
+            image: the name of the tensor of multiples of 1/128.
         """
         scaled = w.node(
             "Mul", "host_front.scale", [image, w.scalar("units", 2.0**PLANES_FRAC_BITS)]
@@ -155,7 +155,7 @@ class Direct:
         w.node("Round", ENCODED, [scaled])
 
     def constants(self) -> None:
-        """Return None: no kit has a core without the layers in front of it."""
+        """Return None, because no kit has a core without a sensor's filters in front of it."""
         return
 
 

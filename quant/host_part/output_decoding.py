@@ -130,18 +130,23 @@ class DualRange(Plain):
         return slice(outputs, None)
 
     def decode(self, result: np.ndarray, scale: float) -> np.ndarray:
-        """Return the fine copy where it is not clipped, else the coarse one, as (N, C, H, W).
+        """Return the fine copy where it is not clipped, else the coarse one.
 
         Args:
             result: (N, 2 C, H, W) float32, multiples of `scale`: all fine copies, then all coarse
                 ones.
-            scale: the value of one unit of the result.
+            scale: the real value of the integer 1 of the result.
+
+        Returns:
+            The decoded values, (N, C, H, W) float32.
         """
         fine, coarse = np.split(result, self.copies, axis=1)
         return _in_dual_range(fine, coarse, scale)
 
     def write(self, w: HostWriter, feeds: list[str], outputs: int, scale: float) -> None:
-        """Write the nodes that choose the fine or the coarse copy."""
+        """Write the nodes that choose the fine or the coarse copy; for the arguments see
+        `Plain.write`.
+        """
         both = w.node("DequantizeLinear", "host_back.both", feeds)
         name = "one_each" if outputs == 1 else "channels_each"
         analytic = [f"host_back.analytic_{k}" for k in range(self.copies - 2)]
@@ -154,7 +159,12 @@ class DualRange(Plain):
         w.node("Where", self._chosen, [fits, names[0], wide])
 
     def constants(self, scale: float) -> Constants:
-        """Return the limit of the fine copy, and the gain of the coarse one."""
+        """Return the constants of a kit's `host.py`: the largest valid value of the fine copy, and
+        GAIN.
+
+        Args:
+            scale: the real value of the integer 1 of the result.
+        """
         return {"decoding": "dual range", "fine_max": _fine_limit(scale), "gain": GAIN}
 
 
@@ -192,11 +202,18 @@ class OffsetWindows(Plain):
         return OffsetWindows(tuple(map(tuple, (np.array(self.offsets) + fine).tolist())))
 
     def decode(self, result: np.ndarray, scale: float) -> np.ndarray:
-        """Decode a result (N, copies C, H, W) as (N, C, H, W).
+        """Combine the copies of each channel to one value.
 
-        The first copy of each channel is coarse. Each other one is fine around its offset, and
-        clipped elsewhere. A value comes from the last window that does not clip it, or else from
-        the coarse copy.
+        A value comes from the last window whose copy is not clipped, plus the window's offset. If
+        all are clipped, it comes from the coarse copy.
+
+        Args:
+            result: (N, copies C, H, W) float32, multiples of `scale`: the coarse copy of all
+                channels, then the windows.
+            scale: the real value of the integer 1 of the result.
+
+        Returns:
+            The decoded values, (N, C, H, W) float32.
         """
         coarse, *windows = np.split(result, self.copies, axis=1)
         value = coarse * np.float32(GAIN)
@@ -205,7 +222,9 @@ class OffsetWindows(Plain):
         return value
 
     def write(self, w: HostWriter, feeds: list[str], outputs: int, scale: float) -> None:
-        """Write the nodes that choose the last window that holds a value."""
+        """Write the nodes that choose the last window which holds a value; for the arguments see
+        `Plain.write`.
+        """
         every = w.node("DequantizeLinear", "host_back.all", feeds)
         names = [f"host_back.window_{k}" for k in range(self.copies)]
         sizes = w.constant("channels_each", np.full(self.copies, outputs))
@@ -221,7 +240,12 @@ class OffsetWindows(Plain):
             value = w.node("Where", result, [inside, moved, value])
 
     def constants(self, scale: float) -> Constants:
-        """Return the limit of the fine copies, the gain of the coarse one, and the offsets."""
+        """Return the constants of a kit's `host.py`: the largest valid value of a fine copy, GAIN
+        and the offsets.
+
+        Args:
+            scale: the real value of the integer 1 of the result.
+        """
         return {
             "decoding": "offset windows",
             "fine_max": _fine_limit(scale),
@@ -268,15 +292,19 @@ class BankSum(DualRange):
         return self.coarse_copies * WIDE / (UNIT_STEPS * scale)
 
     def decode(self, result: np.ndarray, scale: float) -> np.ndarray:
-        """Return the sum of the correction and the analytic restoration, (N, C, H, W).
+        """Return the sum of the correction and the analytic restoration.
 
-        The correction is decoded in dual range. The analytic restoration is the sum of its fine
-        copies, or the coarse copy where the fine ones are clipped.
+        The correction comes from its fine copy, or from the coarse one where that is clipped. The
+        analytic restoration is the sum of its fine copies, or the coarse copy where these are
+        clipped.
 
         Args:
             result: (N, copies C, H, W) float32, multiples of `scale`: fine and coarse correction,
                 then the analytic copies.
-            scale: the value of one unit of the result.
+            scale: the real value of the integer 1 of the result.
+
+        Returns:
+            The sum, (N, C, H, W) float32.
         """
         fine, coarse, *analytic = np.split(result, self.copies, axis=1)
         fine_sum = np.sum(analytic[: self.fine_copies], 0) * np.float32(self._fine_gain(scale))
@@ -287,7 +315,9 @@ class BankSum(DualRange):
         return np.asarray(_in_dual_range(fine, coarse, scale) + fine_sum)
 
     def write(self, w: HostWriter, feeds: list[str], outputs: int, scale: float) -> None:
-        """Write the nodes that add the correction and the analytic restoration."""
+        """Write the nodes that decode correction and analytic restoration, and add both; for the
+        arguments see `Plain.write`.
+        """
         super().write(w, feeds, outputs, scale)
         analytic = [f"host_back.analytic_{k}" for k in range(ANALYTIC_COPIES)]
         fine_sum = w.node("Sum", "host_back.analytic", analytic[: self.fine_copies])
@@ -303,7 +333,12 @@ class BankSum(DualRange):
         w.node("Add", DECODED, [self._chosen, added])
 
     def constants(self, scale: float) -> Constants:
-        """Return the constants of the dual range, and those of the analytic copies."""
+        """Return the constants of a kit's `host.py`: those of `DualRange`, and the factors of the
+        analytic copies.
+
+        Args:
+            scale: the real value of the integer 1 of the result.
+        """
         return {
             **super().constants(scale),
             "decoding": "bank sum",

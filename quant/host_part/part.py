@@ -65,12 +65,13 @@ class HostPart:
     def of(
         cls, network: SplitNetwork, decoding: OutputDecoding, input_ranges: Ranges = ()
     ) -> "HostPart":
-        """Build the host's part of a float network that reads the image.
+        """Build the host's part of a float network that reads the image itself.
 
         Args:
-            network: the float network, split into its core and the host's part.
-            decoding: the decoding of the core's result.
-            input_ranges: the input ranges of the image's channels; empty if all are in [0, 1].
+            network: the float network, split into host and DPU part.
+            decoding: combines the copies of each channel that the core writes.
+            input_ranges: the range (low, high) of each channel of the image; empty if all are in
+                [0, 1].
         """
         channels = network.core_channels
         return cls(

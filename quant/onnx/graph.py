@@ -267,11 +267,11 @@ class OnnxGraph:
         bias: np.ndarray | None = None,
         **attributes: Any,
     ) -> Node:
-        """Return a convolution, and store its weights.
+        """Build a convolution node, and store its weights and bias as constants of the graph.
 
         Args:
-            source: the tensor that it reads.
-            output: the tensor that it writes.
+            source: the name of the tensor that it reads.
+            output: the name of the tensor that it writes.
             name: the name of the node.
             weight: (O, I / groups, kh, kw), stored as float32.
             bias: (O,), stored as float32; None for none.

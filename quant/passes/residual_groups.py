@@ -43,7 +43,7 @@ PASSING = (Concat, MaxPool, AveragePool, Resize)
 
 
 def only(name: str) -> ResidualGroup:
-    """Return a group that consists of one tensor."""
+    """Return one tensor as a group by itself, so that functions for residual groups accept it."""
     return {name: slice(None)}
 
 

@@ -120,9 +120,9 @@ class AxisNode:
         """Select from numbers for several axes the one for the node's side, rows or columns.
 
         Args:
-            numbers: one number per axis.
-            axes: the axes of (N, C, H, W) that they are for; a negative one counts from the last.
-            otherwise: returned if there is no number for this side.
+            numbers: one number for each of `axes`.
+            axes: axes of (N, C, H, W); a negative one counts from the last.
+            otherwise: the value that is returned if no number is for this side.
         """
         # A negative axis counts from the last one.
         by_axis = dict(zip((int(axis) % 4 for axis in axes), numbers, strict=True))
