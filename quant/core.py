@@ -115,12 +115,14 @@ class Shifts:
     than the accumulator).
 
     Attributes:
-        cut: smallest and largest number of fractional bits of a convolution's weight and input,
-            added, minus those of its result.
-        bias: the same for fractional bits of weight and input minus those of the int8 bias; below 0
-            the bias would be finer than the accumulator.
-        read: the same for the difference of fractional bits between the inputs of an add.
-        write: the same for fractional bits of an add's coarsest input minus those of its result.
+        cut: the range of shift_cut: the fractional bits of a convolution's weights plus those of
+            its input, minus those of its result.
+        bias: the range of shift_bias: the fractional bits of weights plus input, minus those of the
+            int8 bias. Below 0 the bias would be finer than the accumulator.
+        read: the range of shift_read: the difference of fractional bits between the inputs of an
+            add.
+        write: the range of shift_write: the fractional bits of an add's coarsest input minus those
+            of its result.
     """
 
     cut: tuple[int, int] = (0, 16)
@@ -219,7 +221,7 @@ class IntCore:
 
     @property
     def convolutions(self) -> list[IntConv]:
-        """The operations that have weights."""
+        """The operations that have weights, in order."""
         return [op for op in self.ops if isinstance(op, IntConv)]
 
 
@@ -271,8 +273,8 @@ def build_core(
     cannot reach from one to the next.
 
     Args:
-        graph: a float graph that reads the int8 planes of an image (`PLANES`), not the image
-            itself.
+        graph: a float graph that reads the int8 planes that an image is split into (`PLANES`), not
+            the image itself.
         frac_bits: the number of fractional bits wanted for each activation by its tensor's name,
             such as those of least squared error.
         shifts: the smallest and largest shifts that the target allows.

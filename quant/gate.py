@@ -82,7 +82,7 @@ def metric_value(name: str, result: np.ndarray, reference: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class Spread:
-    """Differences of INT8 from float over the patches of a gate, one by one and as a histogram.
+    """Differences of INT8 from float over the patches that both networks were run on.
 
     Attributes:
         counts: (2 * 4095 + 1,) the number of pixels for each difference INT8 - float, rounded to
@@ -180,26 +180,27 @@ class GateResult:
 
     @property
     def source(self) -> str:
-        """A description of the samples that the figures come from."""
+        """A description of the samples that the figures come from, such as "64 samples"."""
         kind = "simulated patches of 128 x 128" if self.simulated else "samples"
         return f"{self.patches} {kind}"
 
     @property
     def drop_db(self) -> float:
-        """PSNR that INT8 loses against the reference."""
+        """The PSNR in dB that INT8 loses against the reference: that of float less that of INT8."""
         return self.psnr_float_db - self.psnr_int8_db
 
     @property
     def gain_db(self) -> float:
-        """PSNR that the float network gains over its input."""
+        """The PSNR in dB against the reference that the float network gains over its input."""
         return self.psnr_float_db - self.psnr_degraded_db
 
     @property
     def std_over_mae(self) -> float:
-        """Standard deviation over MAE: 1.25 for rounding, whose errors are nearly Gaussian, and
-        more with clipping.
+        """The standard deviation of the difference over the MAE, which shows whether values were
+        clipped.
 
-        It is 0 if there is no difference.
+        Rounding, whose errors are nearly Gaussian, makes it 1.25; clipping makes it larger. It is 0
+        if there is no difference.
         """
         return 0.0 if self.mae == 0 else self.std / self.mae
 
@@ -218,8 +219,8 @@ def compare(
     small.
 
     Args:
-        float_session: the float network's.
-        int8_session: the INT8 network's.
+        float_session: an onnxruntime session of the float network.
+        int8_session: an onnxruntime session of the INT8 network.
         patches: the images that both are run on, with their references.
         metric: one of `METRICS`, by which both results are also compared with the references; empty
             for none.

@@ -36,17 +36,17 @@ as values of another scale.
 
 
 def read_ranges(option: object, channels: int) -> Ranges:
-    """Return the ranges that a user states.
+    """Read the ranges of a network's input that a user states.
 
     Args:
         option: text LOW,HIGH or such a pair for each channel, or an array of the same numbers.
         channels: the number of the network's channels.
 
     Returns:
-        One pair for each channel; empty if all are [0, 1].
+        A pair (low, high) for each channel; empty if all are [0, 1].
 
     Raises:
-        OptionError: other text, another number of pairs, or ends that are no range.
+        OptionError: the option has another form or another number of pairs, or a pair is no range.
     """
     try:
         numbers = option.split(",") if isinstance(option, str) else np.ravel(option)  # type: ignore[call-overload]
@@ -118,7 +118,7 @@ def ranges_of(images: Iterable[np.ndarray]) -> Ranges:
 
 
 def ranges_of_result(result: np.ndarray, image: np.ndarray, ranges: Ranges) -> Ranges:
-    """Return the ranges of which a result is compared in shares.
+    """Return the ranges relative to which a network's result is compared, so that 1 is full scale.
 
     1. A network may read normalised pixels and return an image in [0, 1], of which shares of the
        input's range would hide errors: such a result has the range [0, 1].
@@ -129,8 +129,8 @@ def ranges_of_result(result: np.ndarray, image: np.ndarray, ranges: Ranges) -> R
 
     Args:
         result: the result of the float network, (1, C', H', W').
-        image: (1, C, H, W) from which it was computed.
-        ranges: the ranges of the image's channels; empty where all are [0, 1].
+        image: the image (1, C, H, W) from which the result was computed.
+        ranges: the range (low, high) of each channel of the image; empty if all are in [0, 1].
     """
     if share_within(result, *AROUND_UNIT) >= NEARLY_ALL:
         return ranges if share_within(image, *AROUND_UNIT) >= NEARLY_ALL else ()

@@ -212,12 +212,12 @@ class GraphWriter:
         domain: str | None = None,
         **attributes: int | float | str | list[int],
     ) -> str:
-        """Append an operator with one result, and return the name of the result.
+        """Append a node with one result, and return the name of the result.
 
         Args:
             kind: the operator.
-            output: name of the result.
-            inputs: names of its inputs.
+            output: the name of the result.
+            inputs: the names of the tensors that the node reads.
             name: the name of the node; that of the result if empty.
             domain: the domain of the operator; None for the domain of the writer.
             attributes: the attributes of the node.

@@ -148,14 +148,14 @@ class Measured:
         return cls(pairs, floats, dict(zip(names, limits, strict=True)), host_part)
 
     def corrections(self, graph: Graph, grids: Mapping[str, Grid]) -> Iterator[np.ndarray]:
-        """Yield the results of a plane-reading graph whose tensors are rounded to grids.
+        """Run a float graph with some tensors rounded to grids, on all samples.
 
         Args:
-            graph: a float graph that reads the planes instead of the image.
+            graph: a float graph that reads the int8 planes that an image is split into.
             grids: the grid of each rounded tensor by name. Other tensors stay in float.
 
         Yields:
-            The correction of each image, (1, C, H', W') float32, as the graph computes it.
+            The result for each image, (1, C, H', W') float32, before the host adds the image.
         """
         model = rounded_model(graph_to_onnx(graph, [CORRECTION], self.host_part.planes), grids)
         session = open_session(model)
@@ -194,12 +194,13 @@ class Measured:
     def cost_of_step(
         self, graph: Graph, axes: tuple[int, ...] | None, zero_point: bool, powers: bool
     ) -> Cost:
-        """Return the loss of a float graph whose weights and tensors are rounded to grids.
+        """Return the loss of the float network with weights and tensors rounded as one step of the
+        module says.
 
         Args:
             graph: the float network, which reads the image.
-            axes: axes of weights (O, I, kh, kw) over which a scale is shared; None shares one scale
-                over all of them.
+            axes: the axes of weights (O, I, kh, kw) over which a scale is shared; None shares one
+                scale over all of them.
             zero_point: if True, the grid of a tensor reaches from its smallest to its largest
                 value. Otherwise it lies around 0.
             powers: if True, scales are rounded up to powers of two.
@@ -219,10 +220,10 @@ class Measured:
         return self.cost(self.host_part.finish(image, each) for (image, _), each in pairs)
 
     def cost_of_integers(self, result: Quantized, clips: bool) -> Cost:
-        """Return the loss of the INT8 network's own integers and scales.
+        """Return the loss of the integers and scales of an INT8 network, with or without clipping.
 
         Args:
-            result: the INT8 network.
+            result: the quantised network.
             clips: if True, tensors are clipped to int8. Otherwise their integers have no limits, so
                 that the difference of both losses is the loss by clipping.
         """

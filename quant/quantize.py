@@ -117,7 +117,8 @@ class Plan:
     `rounded` carries a plan out on calibration images.
 
     Attributes:
-        graph: a float graph that reads the int8 planes of an image instead of the image.
+        graph: a float graph that reads the int8 planes that an image is split into instead of the
+            image.
         host_part: the host's pre- and post-processing.
         groups: residual groups, each a set of tensors that adds connect and that share one scale.
         singles: tensors whose channels are equalized in addition to the groups, or without groups.

@@ -129,7 +129,8 @@ def layer_errors(
     jointly.
 
     Args:
-        graph: the float graph that was rounded to `core`. It reads the int8 planes of an image.
+        graph: the float graph that was rounded to `core`. It reads the int8 planes that an image is
+            split into.
         core: the same operations in integers.
         crops: images (1, C, h, w) as the network reads them. Each is run once for every layer.
 
@@ -209,15 +210,16 @@ def _in_int8(op: Op, core: IntCore, exact: Mapping[str, np.ndarray]) -> np.ndarr
 
 
 def layer_error_rows(result: Quantized, patches: Patches) -> list[Row]:
-    """Return the error that each layer causes if it alone is in int8, as table rows.
+    """Measure the error that each layer causes if it alone is in int8, as table rows.
 
     Args:
         result: the quantised network.
-        patches: the calibration patches, of which a few are used.
+        patches: the calibration patches. A crop of each of the first few is run.
 
     Returns:
-        A row for each layer: the SQNR of its result in dB, the error of the network's result, and
-        the layer's share of the squared errors of all. The last row has the whole network in int8.
+        A row for each layer: the SQNR (signal-to-quantization-noise ratio) of its result in dB, the
+        error of the network's result, and the layer's share of the squared errors of all layers.
+        The last row has the whole network in int8.
     """
     crops = few_crops(patches.degraded, result.host)
     layers, together = layer_errors(result.graph, result.core, crops)

@@ -103,7 +103,7 @@ def run(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:
     """Restore an image by a network whose result has the shape of its input.
 
     Args:
-        session: the network's.
+        session: a session of the network, as `open_session` returns it.
         image: (N, C, H, W) float32 as the network reads it.
 
     Returns:
@@ -119,10 +119,10 @@ def run(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:
 
 
 def result_of(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:
-    """Return a network's first output for an image, of whatever shape it is.
+    """Run a network on an image, and return its first output, of whatever shape it is.
 
     Args:
-        session: the network's.
+        session: a session of the network, as `open_session` returns it.
         image: (N, C, H, W) float32 as the network reads it.
 
     Raises:
@@ -137,7 +137,7 @@ def tensors_of(
     """Run a network on an image, and return several of its outputs.
 
     Args:
-        session: the network's.
+        session: a session of the network, as `open_session` returns it.
         names: the names of the outputs, in the order in which they are returned; None for all.
         image: (N, C, H, W) float32 as the network reads it.
 

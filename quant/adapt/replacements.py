@@ -71,7 +71,7 @@ EXACT = {
 
 
 def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
-    """Return the kind of operator that a node is.
+    """Return the kind of replaceable operator that a node is, if a DPU lacks it.
 
     Args:
         graph: the graph that the node belongs to.
@@ -179,14 +179,17 @@ def nodes_by_kind(graph: OnnxGraph) -> dict[Kind, list[Node]]:
 def replaced(
     model: onnx.ModelProto, approximated: Collection[Kind], exact: Collection[Kind]
 ) -> onnx.ModelProto:
-    """Return a copy of a network with some kinds of nodes replaced.
+    """Return a copy of a network in which operators of some kinds are replaced by ones that a DPU
+    computes.
 
-    Tensors have the same names, except those within an exact replacement.
+    Tensors keep their names. New names occur only within an exact replacement, which has several
+    nodes.
 
     Args:
         model: a simplified float network; not changed.
-        approximated: kinds that another function replaces.
-        exact: kinds that are computed exactly by other operators. A kind in both is approximated.
+        approximated: the kinds that are replaced by another function, which is near the original.
+        exact: the kinds that are replaced by several operators with the same result. A kind in both
+            is approximated.
     """
     network = deepcopy(model)
     graph = OnnxGraph(network)

@@ -76,10 +76,11 @@ class LayerWriter:
         self.weights_length = 0
 
     def write(self, number: int, op: IntConv | Op) -> None:
-        """Add the constants and the call of an operation.
+        """Write an operation in C: add its constants, and the call that computes it.
 
         Args:
-            number: place of the operation in the core, from 1 on. It makes the names in C unique.
+            number: the place of the operation in the core, from 1 on. It makes the names in C
+                unique.
             op: the operation.
 
         Raises:
@@ -197,7 +198,7 @@ def plain(name: str) -> str:
 
 
 def comment(*paragraphs: str) -> str:
-    """Return paragraphs as one comment of C.
+    """Format paragraphs as one C comment.
 
     Args:
         paragraphs: texts that do not contain the end of a C comment. Each begins on a new line and

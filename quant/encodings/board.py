@@ -141,13 +141,14 @@ class BoardWriter(GraphWriter):
         )
 
     def operation(self, op: IntConv | Op, feeds: list[str], output: str) -> None:
-        """Write an operation on dequantised tensors, with int8 weights and bias before a
-        DequantizeLinear.
+        """Write an operation that reads and writes dequantised tensors.
+
+        A convolution's weights and bias are stored as int8, with a DequantizeLinear behind each.
 
         Args:
             op: the operation.
-            feeds: names of its dequantised inputs.
-            output: name of its result in float.
+            feeds: the names of the dequantised tensors that it reads.
+            output: the name of its result in float, before it is quantised.
         """
         if isinstance(op, IntConv):
             weight = onnx_weight(op.weight, op.transposed)
@@ -171,20 +172,20 @@ CLAMPS = (Activation.relu, Activation.relu6)
 
 
 def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> onnx.ModelProto:
-    """Write VINT8, the file that AMD's current NPU flow compiles.
+    """Write a core as VINT8, the INT8 file that AMD's current flow for its NPU compiles.
 
-    It has the integers of the board's file in another layout, for one image of one tile, with every
+    It has the integers of the board's file in another layout, for an image of one size, with every
     size stated. Each reader of a tensor has its own pair of QuantizeLinear and DequantizeLinear,
     and each tensor its own scale and zero point.
 
-    A pair also separates an operation from its clamp, as AMD's quantiser writes it. No bit changes,
-    because a value on the grid of the result may be clamped before or after rounding. LeakyReLU is
-    not a clamp: it follows the sums directly, as the core computes it.
+    A pair also separates an operation from its clamp (ReLU or ReLU6), as AMD's quantiser writes it.
+    No bit changes, because a value on the grid of the result may be clamped before or after
+    rounding. LeakyReLU is not a clamp: it follows the sums directly, as the core computes it.
 
     Args:
         core: the integer core.
-        about: metadata of the file.
-        tile_px: side of the tile in pixels of the image.
+        about: metadata of the file, by key.
+        tile_px: rows and columns of the image for which the file is fixed.
 
     Raises:
         OptionError: `tile_px` is None.

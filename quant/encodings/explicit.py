@@ -33,12 +33,13 @@ OPERATORS = frozenset(
 
 
 def made_explicit(model: onnx.ModelProto, texts: dict[str, str]) -> onnx.ModelProto:
-    """Return a model that computes the same, and states attributes, shapes and its producer.
+    """Return a model that computes the same and leaves nothing to defaults: attributes, shapes and
+    producer are stated.
 
     Args:
-        model: the model of ONNX's own operators. Its attributes and descriptions are changed in
+        model: a model of ONNX's own operators. Its attributes and descriptions are changed in
             place.
-        texts: descriptions of the graph, its inputs and outputs, by their names.
+        texts: the descriptions of the graph, its inputs and its outputs, by their names.
 
     Returns:
         A model with the shape of every tensor that ONNX can infer.

@@ -61,14 +61,16 @@ def _writer(graph: OnnxGraph, name: str) -> Node | None:
 
 
 def aligned(graph: OnnxGraph, node: Node) -> dict[Node, list[Node]]:
-    """Return the nodes that replace a Resize and the reducing nodes in front of it.
+    """Return the nodes that replace a spatial attention by one whose map has an integer fraction of
+    the size.
 
     Args:
         graph: the graph that the node belongs to; its constants are extended.
-        node: any node.
+        node: any node; only a Resize can end an attention.
 
     Returns:
-        The new nodes of each replaced one; empty if the node is no Resize of attention.
+        A dict from each replaced node, the Resize and those that reduce the map in front of it, to
+        the new nodes in its place. It is empty if the node ends no attention.
     """
     nodes = shrinking(graph, node)
     if not nodes:

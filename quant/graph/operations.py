@@ -161,7 +161,7 @@ class Conv(OneInput):
 
     @property
     def ceilings(self) -> np.ndarray:
-        """The values (O,) at which ReLU6 clips each channel."""
+        """The value (O,) at which ReLU6 clips each channel: `ceiling`, or 6 for all."""
         return np.full(len(self.bias), float(SIX)) if self.ceiling is None else self.ceiling
 
 
@@ -272,7 +272,7 @@ class Shuffle(OneInput):
 
     @property
     def inverse(self) -> "Shuffle":
-        """The shuffle that moves all values back."""
+        """The shuffle that moves all values back to where they were."""
         return replace(self, up=not self.up)
 
 
@@ -373,10 +373,13 @@ def read_planes(graph: Graph, full_scale: np.ndarray | None = None) -> Graph:
 
 
 def fold_full_scale(graph: Graph, full_scale: np.ndarray | None) -> Graph:
-    """Return the same graph for an image whose channels are divided by their full scale.
+    """Return the graph that computes the same from an image whose channels were divided by their
+    full scale.
+
+    The weights that read a channel are multiplied by its full scale.
 
     Args:
-        graph: the graph that reads the image, by convolutions alone.
+        graph: a float graph that reads the image, by convolutions alone.
         full_scale: (C,) the value of each channel that becomes 1; None returns `graph` itself.
     """
     if full_scale is None:

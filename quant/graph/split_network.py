@@ -72,7 +72,9 @@ class SplitNetwork:
 
     @property
     def core_channels(self) -> int:
-        """The number of channels that the DPU's part reads."""
+        """The number of channels that the DPU's part reads: those of the image after the unshuffles
+        of `front`.
+        """
         return self.channels * int(np.prod([shuffle.block**2 for shuffle in self.front], initial=1))
 
 

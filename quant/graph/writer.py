@@ -30,7 +30,7 @@ from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 
 
 def graph_to_onnx(graph: Graph, outputs: list[str], channels: int = 3) -> onnx.ModelProto:
-    """Write a float graph that reads the int8 planes of an image as an ONNX model.
+    """Write a float graph as an ONNX model that reads the int8 planes that an image is split into.
 
     Its input is the tensor `planes` (N, channels, H, W) float32.
 

@@ -109,7 +109,7 @@ class HostPart:
 
     @property
     def planes(self) -> int:
-        """The number of int8 planes that the core reads."""
+        """The number of int8 planes that the core reads, of all channels together."""
         return self.encoding.planes * self.channels
 
     @property
@@ -125,23 +125,27 @@ class HostPart:
 
     @property
     def place_px(self) -> int:
-        """The side in pixels of the square of the image that is one place of the core's planes."""
+        """The side in pixels of the square of the image that becomes one pixel of the core's
+        planes.
+        """
         return math.prod(shuffle.block for shuffle in self.front)
 
     @property
     def correction_px(self) -> int:
-        """The side in pixels of the square of the sum that is one place of the core's result."""
+        """The side in pixels of the square that one pixel of the core's result becomes, when the
+        image is added.
+        """
         return math.prod(shuffle.block for shuffle in self.back)
 
     def encode(self, image: np.ndarray) -> np.ndarray:
-        """Encode an image as the core's planes.
+        """Encode an image as the int8 planes that the core reads.
 
         Args:
             image: (N, C, H, W) in the network's units. Sides are multiples of `place_px`.
 
         Returns:
-            Planes (N, P, H', W') int8, with P as in `planes`; H' and W' count places of `place_px`
-            pixels, those of the mirrored border included.
+            Planes (N, P, H', W') int8, with P as in `planes`. H' and W' are H and W with the
+            mirrored border, divided by `place_px`.
         """
         if self.border_px:
             image = np.pad(image, ((0, 0), (0, 0), *[(self.border_px,) * 2] * 2), "reflect")

@@ -25,7 +25,7 @@ class HostWriter(GraphWriter):
         return self.constant(name, np.array(value, np.float32))
 
     def zero_point(self) -> str:
-        """Return the name of the constant 128."""
+        """Store the uint8 zero point 128 as a constant, and return its name."""
         return self.constant("zero_point", np.array(ZERO, np.uint8))
 
     def split(self, source: str, sizes: str, names: Sequence[str]) -> None:

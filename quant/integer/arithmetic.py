@@ -254,7 +254,8 @@ def activation_table(op: Pointwise, frac_bits: Mapping[str, int]) -> np.ndarray:
 
     Args:
         op: the activation.
-        frac_bits: the fractional bits of its input and of its output, by the name of the tensor.
+        frac_bits: the number of fractional bits of each tensor by its name, at least of the two
+            that the activation reads and writes.
 
     Returns:
         (256,) int16, clipped to int8.

@@ -114,7 +114,9 @@ class Node:
 
     @property
     def output_padding(self) -> Sequence[int]:
-        """Rows and columns that a transposed convolution adds behind its result."""
+        """The numbers of rows and columns that a transposed convolution adds at the end of its
+        result.
+        """
         return self.attributes.get("output_padding", (0, 0))  # type: ignore[no-any-return]
 
 
@@ -332,7 +334,7 @@ def constants(model: onnx.ModelProto) -> dict[str, np.ndarray]:
 
 
 def attributes_of(node: NodeProto) -> dict[str, Any]:
-    """Return the attributes that a node states, by name, with byte strings decoded to str."""
+    """Return the attributes that a node of a file states, by name, with byte strings decoded."""
     values = {a.name: helper.get_attribute_value(a) for a in node.attribute}
     return {k: v.decode(errors="replace") if isinstance(v, bytes) else v for k, v in values.items()}
 

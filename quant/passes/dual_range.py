@@ -37,8 +37,8 @@ def with_copies(graph: Graph, decoding: OutputDecoding) -> Graph:
     host decodes.
 
     Args:
-        graph: a float graph that reads the int8 planes of an image. If the decoding has several
-            copies, `can_write_copies` must be True for it.
+        graph: a float graph that reads the int8 planes that an image is split into. If the decoding
+            has several copies, `can_write_copies` must be True for it.
         decoding: the host's decoding, which states the copies and the factor of each.
 
     Returns:
@@ -66,7 +66,7 @@ def with_windows(
     than one copy over all of it.
 
     Args:
-        graph: a float graph that reads the int8 planes of an image.
+        graph: a float graph that reads the int8 planes that an image is split into.
         host_part: the host part of the network.
         frac_bits: the number of fractional bits of the result's scale as a single copy.
         images: calibration images (1, C, H, W), on which the range of the result is measured.

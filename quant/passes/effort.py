@@ -62,15 +62,15 @@ TURNS = 4
 
 
 def channel_groups(ranges: np.ndarray, most: int) -> list[np.ndarray]:
-    """Divide channels into groups of similar range, whose factors are tried together.
+    """Divide channels into groups of similar range, each of which is tried with one common factor.
 
     Args:
-        ranges: the ranges of the channels, (C,).
+        ranges: (C,) the ranges of the channels.
         most: the maximum number of groups; 0 for none. If it is at least C, each channel is a group
             of its own.
 
     Returns:
-        The numbers of the channels of each group.
+        The numbers of the channels in each group.
     """
     if most >= len(ranges):
         return list(np.arange(len(ranges))[:, None])
@@ -182,7 +182,7 @@ def work_of(graph: Graph, host_part: HostPart, crop: np.ndarray) -> list[int]:
     Rounding a result counts as the number of multiply-accumulates that take as long.
 
     Args:
-        graph: a float graph that reads the int8 planes of an image.
+        graph: a float graph that reads the int8 planes that an image is split into.
         host_part: the host part of the graph.
         crop: (1, C, h, w) a part of an image.
 

@@ -115,7 +115,7 @@ def channel_ranges(
     over tiles.
 
     Args:
-        graph: a float graph that reads the int8 planes of an image.
+        graph: a float graph that reads the int8 planes that an image is split into.
         group: the tensors of the group.
         images: calibration images (1, C', H, W).
         host_part: the host part of the graph.
@@ -146,7 +146,7 @@ def channel_sizes(
     """Yield, for every tile of the images, a quantile of the absolute values of each channel.
 
     Args:
-        graph: a float graph that reads the int8 planes of an image.
+        graph: a float graph that reads the int8 planes that an image is split into.
         names: the names of the tensors.
         images: calibration images (1, C', H, W).
         host_part: the host part of the graph.

@@ -176,7 +176,8 @@ def single_ranges(
     within.
 
     Args:
-        graph: the float graph to which the tensors belong. It reads the int8 planes of an image.
+        graph: the float graph to which the tensors belong. It reads the int8 planes that an image
+            is split into.
         singles: the tensors.
         images: calibration images (1, C, H, W), which are cut to tiles.
         host_part: the host part of the graph.

@@ -26,7 +26,7 @@ def choose_frac_bits(
     """Choose the power-of-two scale of every tensor of a float graph.
 
     Args:
-        graph: a float graph that reads the int8 planes of an image.
+        graph: a float graph that reads the int8 planes that an image is split into.
         images: calibration images (1, C, H, W) as the network reads them. They are read twice.
         host_part: the host part of the graph.
         least_squares: True chooses the scale of least squared error. False chooses the finest scale

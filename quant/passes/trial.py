@@ -76,7 +76,7 @@ def search_targets(
     sizes of corrections are stored.
 
     Args:
-        graph: a float graph that reads the int8 planes of an image.
+        graph: a float graph that reads the int8 planes that an image is split into.
         host_part: the host part of the graph.
         images: calibration images (1, C, H, W).
         count: the number of crops; fewer are returned if there are not enough.

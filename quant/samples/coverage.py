@@ -85,10 +85,10 @@ class SampleRange:
 
 
 def histogram(sample: np.ndarray) -> np.ndarray:
-    """Count the pixels of a sample by value.
+    """Count the pixels of a sample by value, in BINS bins over [0, 1].
 
     Args:
-        sample: the sample of any shape, with values in [0, 1].
+        sample: values in [0, 1] of any shape.
 
     Returns:
         (BINS,) counts; the last bin also holds the value 1.

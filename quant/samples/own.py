@@ -100,7 +100,9 @@ class OwnSamples:
 
     @property
     def about(self) -> dict[str, str]:
-        """The metadata by which an INT8 file describes its calibration."""
+        """The metadata by which an INT8 file describes its calibration: the samples' name, digests
+        and ranges.
+        """
         digests = " ".join(map(digest_of, self.drawn.degraded))
         about = {"calibration_data": self.name, CALIBRATED_ON: digests}
         if self.ranges:

@@ -68,7 +68,9 @@ class Patches:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of the bytes of all pairs."""
+        """The SHA-256 of the bytes of all pairs, by which files record the patches that they were
+        made with.
+        """
         digest = hashlib.sha256()
         for pair in self.pairs:
             for image in pair:

@@ -138,7 +138,9 @@ class Calibration:
 
     @property
     def for_tuning(self) -> Patches:
-        """Other patches of the same scenes, for fine-tuning, which needs more of them."""
+        """The patches that the integers are fine-tuned on: TUNING_PATCHES others of the same
+        scenes.
+        """
         return self._draw(TUNING_PATCHES, self.seed + TUNING_SEED)
 
     @property
@@ -151,7 +153,9 @@ class Calibration:
 
     @property
     def about(self) -> dict[str, str]:
-        """The metadata by which an INT8 file describes its calibration."""
+        """The metadata by which an INT8 file describes its calibration: the sensor's name, and the
+        seed.
+        """
         return {"calibration_sensor": self.sensor.name, "calibration_seed": str(self.seed)}
 
     def _draw(self, count: int, seed: int) -> Patches:

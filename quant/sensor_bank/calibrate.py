@@ -199,7 +199,8 @@ def bank_results(
             brightnesses, each scaled to [-1, 1].
         scale: S, the side in pixels of the square of the image that is one pixel of the network's
             maps.
-        kernels: the kind of the bank's kernels, "fitted" or "cut".
+        kernels: how the filters got 7 x 7 weights: "fitted" to that size, or "cut" in older
+            networks.
 
     Returns:
         (1, C, H / S, W / S) float32: the int8 results of the filters divided by 128, at a gain of
@@ -328,7 +329,8 @@ def bank_images(
         scale: the side in pixels of the square of the image that is one pixel of the network's
             maps.
         seed: the seed of all random draws.
-        kernels: the kind of the banks' kernels, "fitted" or "cut".
+        kernels: how the filters got 7 x 7 weights: "fitted" to that size, or "cut" in older
+            networks.
 
     Returns:
         Arrays as `bank_results` returns them, which are computed each time they are read.

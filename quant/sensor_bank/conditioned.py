@@ -157,7 +157,8 @@ def bank_layer(bank: Bank, scale: int, shifts: Shifts, kernels: Kernels) -> IntC
         scale: the side in pixels of the square of the image that is one pixel of the network's
             maps.
         shifts: the smallest and largest shifts that the target allows.
-        kernels: the kind of the bank's kernels, "fitted" or "cut".
+        kernels: how the filters got 7 x 7 weights: "fitted" to that size, or "cut" in older
+            networks.
     """
     integers = integer_bank(bank, scale, bank.gain, kernels)
     # The offsets put each copy of a result at another place of a rounding step.

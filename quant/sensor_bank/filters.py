@@ -117,7 +117,8 @@ def integer_bank(bank: Bank, scale: int, gain: float, kernels: Kernels = "fitted
             maps.
         gain: the factor by which the quantisation steps of the results are finer than at a
             reference noise (`Bank.gain`).
-        kernels: the kind of the bank's kernels, "fitted" or "cut".
+        kernels: how the filters got 7 x 7 weights: "fitted" to that size, or "cut" in older
+            networks.
     """
     steps = np.concatenate([bank.kernels, bank.kernels[-1:] / WIDE])
     # The kernels multiply shares of full scale, but the planes hold digital numbers.
