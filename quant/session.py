@@ -212,7 +212,7 @@ def tensor_values(
         names: the names of the tensors.
         image: (1, C', H, W) in the network's units.
         halo_px: the halo as `halo_of` returns it. With None the image is one tile.
-        host_part: the host part that makes planes of the image.
+        host_part: the host's processing, which makes planes of the image.
 
     Yields:
         For each tile the tensors (1, C, h, w) in the order of `names`.
@@ -240,7 +240,7 @@ def values_of(
         graph: a float graph that reads the planes of an image (`planes_of`).
         names: the names of the tensors.
         images: (1, C', H, W) in the network's units.
-        host_part: the host part that makes planes of the images.
+        host_part: the host's processing, which makes planes of the images.
 
     Yields:
         For each tile of each image the tensors (1, C, h, w) in the order of `names`.
@@ -255,7 +255,7 @@ def planes_of(image: np.ndarray, host_part: HostPart = ONE_CHANNEL) -> np.ndarra
 
     Args:
         image: (N, C, H, W) in the network's units.
-        host_part: the host part that encodes the image.
+        host_part: the host's processing, which encodes the image.
 
     Returns:
         (N, P, H', W') float32, multiples of 2^-PLANES_FRAC_BITS, with P as in `HostPart.planes`.

@@ -55,10 +55,13 @@ class Plain:
         """Return the channels of the core's result that no other copy replaces where they are
         clipped.
 
-        A clipped value there is lost, so that the gate counts it as saturated.
+        A clipped value there is lost, so that the check for saturation counts it.
 
         Args:
             outputs: the number of decoded channels.
+
+        Returns:
+            A slice of the channels.
         """
         return slice(None)
 

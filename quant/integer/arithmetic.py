@@ -233,8 +233,8 @@ def bilinear_weights(factor: int) -> tuple[np.ndarray, int]:
         factor: the factor of rows and columns, 2 or 4.
 
     Returns:
-        Weights (factor^2, 3, 3), and s: the weights of each of the factor^2 pixels that one pixel
-        becomes apply to its 3 x 3 neighbours, and add up to 2^s.
+        Weights (factor^2, 3, 3) and a shift s. Each pixel becomes factor^2 pixels, and each of
+        those has weights for the 3 x 3 neighbours of the pixel, which add up to 2^s.
     """
     places = (np.arange(factor) + 0.5) / factor - 0.5  # half-pixel centres, in input pixels
     shares = np.stack([np.maximum(-places, 0), 1 - np.abs(places), np.maximum(places, 0)], 1)

@@ -67,7 +67,7 @@ def with_windows(
 
     Args:
         graph: a float graph that reads the int8 planes that an image is split into.
-        host_part: the host part of the network.
+        host_part: the host's pre- and post-processing around the network.
         frac_bits: the number of fractional bits of the result's scale as a single copy.
         images: calibration images (1, C, H, W), on which the range of the result is measured.
 

@@ -183,7 +183,7 @@ def work_of(graph: Graph, host_part: HostPart, crop: np.ndarray) -> list[int]:
 
     Args:
         graph: a float graph that reads the int8 planes that an image is split into.
-        host_part: the host part of the graph.
+        host_part: the host's pre- and post-processing around the graph.
         crop: (1, C, h, w) a part of an image.
 
     Returns:

@@ -118,7 +118,7 @@ def channel_ranges(
         graph: a float graph that reads the int8 planes that an image is split into.
         group: the tensors of the group.
         images: calibration images (1, C', H, W).
-        host_part: the host part of the graph.
+        host_part: the host's pre- and post-processing around the graph.
 
     Returns:
         (C,) the ranges, in the tensors' unit.
@@ -149,7 +149,7 @@ def channel_sizes(
         graph: a float graph that reads the int8 planes that an image is split into.
         names: the names of the tensors.
         images: calibration images (1, C', H, W).
-        host_part: the host part of the graph.
+        host_part: the host's pre- and post-processing around the graph.
         quantile: the quantile, in [0, 1].
 
     Yields:

@@ -180,7 +180,7 @@ def single_ranges(
             is split into.
         singles: the tensors.
         images: calibration images (1, C, H, W), which are cut to tiles.
-        host_part: the host part of the graph.
+        host_part: the host's pre- and post-processing around the graph.
         quantile: the quantile of a channel's absolute values that is its range in one tile; 1 means
             the largest value.
         tiles: the quantile of these ranges over the tiles.

@@ -28,7 +28,7 @@ def choose_frac_bits(
     Args:
         graph: a float graph that reads the int8 planes that an image is split into.
         images: calibration images (1, C, H, W) as the network reads them. They are read twice.
-        host_part: the host part of the graph.
+        host_part: the host's pre- and post-processing around the graph.
         least_squares: True chooses the scale of least squared error. False chooses the finest scale
             that clips no value.
 

@@ -77,7 +77,7 @@ def search_targets(
 
     Args:
         graph: a float graph that reads the int8 planes that an image is split into.
-        host_part: the host part of the graph.
+        host_part: the host's pre- and post-processing around the graph.
         images: calibration images (1, C, H, W).
         count: the number of crops; fewer are returned if there are not enough.
 

@@ -102,13 +102,14 @@ class ConditionedCore:
 
 
 def conditioned_core(model: onnx.ModelProto) -> ConditionedCore | None:
-    """Read the core of an INT8 file with the biases that condition it on other sensors.
+    """Read an INT8 file's core together with the biases by which it is conditioned on other
+    sensors.
 
     Args:
         model: an INT8 network.
 
     Returns:
-        The core; None if the network's first layer is no filter bank of a sensor.
+        The core and the biases; None if the network's first layer is no filter bank of a sensor.
 
     Raises:
         ModelError: the file is damaged.
@@ -132,7 +133,8 @@ def conditioned_core(model: onnx.ModelProto) -> ConditionedCore | None:
 
 
 def required_conditioned_core(model: onnx.ModelProto) -> ConditionedCore:
-    """Read the core of an INT8 file with the biases that condition it on other sensors.
+    """Read an INT8 file's core together with the biases by which it is conditioned on other
+    sensors.
 
     Args:
         model: an INT8 network.

@@ -40,7 +40,8 @@ class Affine:
 
 
 def add_negated(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a - b by a + (-b), where the convolution that computes b is negated (1).
+    """Replace a - b by a + (-b), where the convolution that computes b is negated (point 1 of the
+    module).
 
     Args:
         graph: the graph that the node belongs to; the convolution gets other weights.
@@ -59,7 +60,8 @@ def add_negated(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
 
 def negate_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a - b by a + (-b), where a new convolution of one pixel negates b (1).
+    """Replace a - b by a + (-b), where a new convolution of one pixel negates b (point 1 of the
+    module).
 
     Args:
         shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
@@ -79,7 +81,8 @@ def negate_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[
 
 
 def fold_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Fold a node that scales and shifts channels into the convolution in front of it (2).
+    """Fold a node that scales and shifts channels into the convolution in front of it (point 2 of
+    the module).
 
     Args:
         graph: the graph that the node belongs to; the convolution gets other weights.
@@ -105,7 +108,7 @@ def fold_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
 def fold_in_front(graph: OnnxGraph, shapes: Shapes) -> None:
     """Fold nodes that scale and shift channels into the convolutions behind them, where that is
-    exact (3).
+    exact (point 3 of the module).
 
     Args:
         graph: the graph, which is changed in place.

@@ -21,7 +21,7 @@ SLOPE_AND_OFFSET = {"alpha": 1 / 6, "beta": 0.5}
 
 
 def join_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a Clip or a Max that computes a ReLU by Relu (1).
+    """Replace a Clip or a Max that computes a ReLU by Relu (point 1 of the module).
 
     Args:
         graph: the graph that the node belongs to.
@@ -45,7 +45,8 @@ def join_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
 
 def join_hard_swish(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace nodes that together compute a HardSwish or a HardSigmoid by that operator (2).
+    """Replace nodes that together compute a HardSwish or a HardSigmoid by that operator (point 2 of
+    the module).
 
     Args:
         graph: the graph that the node belongs to.
@@ -68,7 +69,8 @@ def join_hard_swish(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
 
 def halve_before_gelu(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Move the factor 1/2 of a GELU, x (1 + Erf(x / sqrt(2))) / 2, in front of the product (3).
+    """Move the factor 1/2 of a GELU, x (1 + Erf(x / sqrt(2))) / 2, in front of the product (point 3
+    of the module).
 
     Args:
         graph: the graph that the node belongs to.

@@ -22,7 +22,8 @@ Part = tuple[str, np.ndarray]
 
 
 def split_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a Split, or a Slice of channels, by operations that compute each part by itself (1).
+    """Replace a Split, or a Slice of channels, by operations that compute each part by itself
+    (point 1 of the module).
 
     Args:
         shapes: the sizes of each float tensor by name, as `float_shapes` returns them.

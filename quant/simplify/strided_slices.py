@@ -17,7 +17,8 @@ BLOCKS = (2, 3, 4)
 
 
 def unshuffle_slices(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace slices of every n-th pixel that are concatenated by one pixel unshuffle (1).
+    """Replace slices of every n-th pixel that are concatenated by one pixel unshuffle (point 1 of
+    the module).
 
     Args:
         shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
