@@ -283,10 +283,10 @@ def _mtf(sensor: Instrument) -> str:
 
 
 def sizes_row(spread: Spread) -> Row:
-    """Return a table row with the shares of pixels, in %, that differ by more than some numbers of
-    DN.
+    """Return a table row with the shares of pixels, in %, whose INT8 value is off by more than some
+    numbers of DN.
 
-    The numbers of digital numbers (DN) are those of BEYOND_DN.
+    BEYOND_DN lists these numbers of digital numbers (DN).
 
     Args:
         spread: the differences of INT8 from float.

@@ -255,14 +255,15 @@ def check_network(network: SplitNetwork) -> None:
 
 
 def sized(graph: Graph, size: Pair) -> Graph:
-    """Return the graph for images of one size, in which global pooling has that size as its window.
+    """Return the graph for images of one size, in which global pooling has its whole map as its
+    window.
 
     Args:
         graph: the operations from the tensor `IMAGE` to `CORRECTION`.
         size: rows and columns of the image.
 
     Raises:
-        ModelError: an operation reads tensors of different sizes.
+        ModelError: an operation reads tensors of sizes that do not fit together.
     """
     sizes = _sizes(graph, size)
     return tuple(

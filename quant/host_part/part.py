@@ -169,16 +169,15 @@ class HostPart:
         return np.asarray(self.decoding.decode(result, scale) * np.float32(self.unit))
 
     def unrounded(self, result: np.ndarray) -> np.ndarray:
-        """Return what `decode` would return for a result in float, where no copy is rounded or
-        clipped.
+        """Return the decoded value of a result in float, where no copy is rounded or clipped.
 
-        The first copy of each channel then has the exact value.
+        The first copy of each channel then has the exact value, so the others are not needed.
 
         Args:
             result: (N, copies C, H, W) of a float network that writes the copies.
 
         Returns:
-            (N, C, H, W), in the unit of `decode` before the factor `unit`.
+            (N, C, H, W): `decode` returns it times `unit`.
         """
         return result[:, : self.outputs] * np.float32(self.decoding.gains[0])
 

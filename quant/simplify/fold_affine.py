@@ -137,8 +137,8 @@ def fold_in_front(graph: OnnxGraph, shapes: Shapes) -> None:
 
 
 def convolve_normalisation(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a BatchNormalization that could not be folded by a depthwise convolution of one pixel
-    (4).
+    """Replace a BatchNormalization that could not be folded by a depthwise convolution (point 4 of
+    the module).
 
     Args:
         shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
