@@ -126,10 +126,11 @@ class Integers:
             self._follow(node)
 
     def resolve(self, name: str) -> str:
-        """Return the int8 tensor whose values a tensor has, behind nodes that are notation only.
+        """Return the tensor whose values a tensor has, once nodes that compute nothing (notation)
+        are removed.
 
         Args:
-            name: the name of a tensor, which is returned if no such node writes it.
+            name: the name of a tensor, which is returned itself if no such node writes it.
         """
         while name in self._same:
             name = self._same[name]

@@ -49,8 +49,8 @@ FILLING = {"ConstantOfShape", "Expand", "Tile"}
 def check_runnable(model: onnx.ModelProto, where: str) -> None:
     """Raise ModelError if a model is not safe or not possible to run.
 
-    Its operators must be ONNX's own or onnxruntime's on integers, and no node may make a tensor of
-    a size that the file does not bound.
+    Its operators must be ONNX's own, or those of onnxruntime that this project writes, and no node
+    may make a tensor of a size that the file does not bound.
 
     Args:
         model: the model, the content of which was checked.
