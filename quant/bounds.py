@@ -24,23 +24,40 @@ Range = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class LayerBound:
-    """Bounds of the operation of this name over all images."""
+    """Bounds of one operation of an integer core that hold for every image.
+
+    Attributes:
+        name: the name of the operation.
+        bits: log2 of the largest absolute value of its accumulator: the bits needed without the
+            sign.
+        low: the smallest result in units of the output's scale, before clipping to int8.
+        high: the largest result, likewise.
+    """
 
     name: str
-    bits: float  # that its accumulator needs at most, without the sign
-    low: int  # of the result before it is clipped to int8
+    bits: float
+    low: int
     high: int
 
     @property
     def saturates(self) -> bool:
-        """True if an image might bring a result to an end of int8."""
+        """True if an image might bring a result to an end of int8, -128 or 127, where values are
+        clipped.
+        """
         return self.low <= INT8_MIN or self.high >= INT8_MAX
 
 
 def layer_bounds(core: IntCore) -> list[LayerBound]:
-    """Compute the largest accumulator and the range of results of every operation, in order.
+    """Compute bounds of the accumulator and of the results of every operation of a core.
 
-    They hold for all images, because they follow from the weights and the ranges of the inputs.
+    The bounds hold for every image, because they follow from the weights and from the ranges of the
+    inputs alone (interval arithmetic). They may be wider than what any image reaches.
+
+    Args:
+        core: the integer core.
+
+    Returns:
+        One `LayerBound` per operation, in the order of the operations.
     """
     ranges: dict[str, Range] = {PLANES: _planes(core)}
     bounds = []

@@ -33,8 +33,17 @@ CANDIDATES = 6
 
 
 def quantize(values: np.ndarray, frac_bits: int) -> np.ndarray:
-    """Round to integers in [-128, 127], half away from zero as the DPU does for
-    weights and bias.
+    """Round real values to int8: q = round(values * 2^frac_bits), half away from zero, clipped to
+    [-128, 127].
+
+    AMD's quantiser rounds weights and biases so. Activations are rounded by `rounded_to` instead.
+
+    Args:
+        values: real values of any shape.
+        frac_bits: the number n of fractional bits of the scale 2^-n.
+
+    Returns:
+        The integers, int8, in the shape of `values`.
     """
     scaled = np.asarray(values, dtype=np.float64) * 2.0**frac_bits
     # AMD's quantiser rounds these away from zero, unlike activations, which round half up.
@@ -43,8 +52,13 @@ def quantize(values: np.ndarray, frac_bits: int) -> np.ndarray:
 
 
 def unclipped_frac_bits(max_abs: float) -> int:
-    """Return the fractional bits of the finest scale that clips nothing; 0 for a
-    tensor of zeros.
+    """Return the number n of fractional bits of the finest scale 2^-n at which int8 clips nothing.
+
+    Args:
+        max_abs: the largest absolute value of the tensor.
+
+    Returns:
+        The largest n with max_abs * 2^n <= 127; 0 for a tensor of zeros.
     """
     return int(np.floor(np.log2(INT8_MAX / max_abs))) if max_abs > 0 else 0
 
@@ -56,8 +70,15 @@ three times faster.
 
 
 def squared_errors(values: np.ndarray, first: int) -> np.ndarray:
-    """Compute the squared rounding and clipping errors with first .. first + CANDIDATES - 1
-    fractional bits, float64.
+    """Compute the sum of squared errors of int8, rounding and clipping together, for six scales.
+
+    Args:
+        values: real values of any shape.
+        first: the number of fractional bits of the coarsest scale that is tried.
+
+    Returns:
+        (CANDIDATES,) float64, in the square of the values' unit: the sums for scales of `first` to
+        `first` + CANDIDATES - 1 fractional bits.
     """
     errors = np.zeros(CANDIDATES)
     for part in np.array_split(values, max(values.size // CACHED, 1)):
@@ -71,26 +92,37 @@ def squared_errors(values: np.ndarray, first: int) -> np.ndarray:
 
 
 def best_frac_bits(values: np.ndarray) -> int:
-    """Return the fractional bits of the least-squares scale of one array."""
+    """Return the number of fractional bits of the power-of-two scale with the least squared error
+    in int8.
+
+    It tries the finest scale that clips nothing, and the next finer ones (CANDIDATES scales).
+
+    Args:
+        values: real values of any shape.
+    """
     first = unclipped_frac_bits(float(np.abs(values).max(initial=0.0)))
     return first + int(np.argmin(squared_errors(np.asarray(values, dtype=np.float32), first)))
 
 
 @dataclass(frozen=True)
 class Shifts:
-    """The shift windows of the DPU's arithmetic (UG1414 3.5 and the quantiser's source, Vitis-AI
-    3.0).
+    """The ranges of the shifts that a DPU's arithmetic allows (UG1414 3.5 and the quantiser's
+    source, Vitis-AI 3.0).
 
-    The quantiser writes within these windows. Files are checked against
-    `deploy.dpu.checker.number_rules`, which allows a little more (a bias finer than the
-    accumulator).
+    A DPU moves between scales 2^-n by shifting, and each kind of shift has a smallest and a largest
+    value in bits. The quantiser writes within these ranges, which are called windows here. Files
+    are checked against `deploy.dpu.checker.number_rules`, which allows a little more (a bias finer
+    than the accumulator).
 
     Attributes:
-        cut: fractional bits of a convolution's weight and input minus those of its result.
-        bias: fractional bits of weight and input minus those of the int8 bias; below 0 the bias
-            would be finer than the accumulator.
-        read: the difference of fractional bits between the inputs of an add.
-        write: fractional bits of an add's coarsest input minus those of its result.
+        cut: the range of shift_cut: the fractional bits of a convolution's weights plus those of
+            its input, minus those of its result.
+        bias: the range of shift_bias: the fractional bits of weights plus input, minus those of the
+            int8 bias. Below 0 the bias would be finer than the accumulator.
+        read: the range of shift_read: the difference of fractional bits between the inputs of an
+            add.
+        write: the range of shift_write: the fractional bits of an add's coarsest input minus those
+            of its result.
     """
 
     cut: tuple[int, int] = (0, 16)
@@ -103,7 +135,11 @@ SHIFTS = Shifts()
 
 
 def target_shifts(target: TargetProfile) -> Shifts:
-    """Return the windows that a target's profile states."""
+    """Return the smallest and largest shifts that the DPU of a target board allows.
+
+    Args:
+        target: the profile of the board, whose table `numbers` states the constants of each shift.
+    """
 
     def window(key: str) -> tuple[int, int]:
         constant = target.constant("numbers", key)
@@ -115,7 +151,7 @@ def target_shifts(target: TargetProfile) -> Shifts:
 
 
 def clamp(value: int, window: tuple[int, int]) -> int:
-    """Return the nearest value within the window."""
+    """Return the integer from window[0] to window[1], both included, that is nearest to `value`."""
     return min(max(value, window[0]), window[1])
 
 
@@ -127,13 +163,26 @@ then follow. Two rounds suffice in practice.
 
 @dataclass(frozen=True)
 class IntConv(OneInput):
-    """An int8 convolution: sum of products, plus bias << shift_bias, activation, shifted right by
-    shift_cut, clipped.
+    """An int8 convolution of the integer core.
+
+    It adds int8 products in an int32 accumulator, adds bias << shift_bias, applies the activation,
+    shifts right by shift_cut with rounding, and clips to int8. Both shifts follow from the
+    fractional bits of the tensors, and are not stored.
+
+    Attributes:
+        weight: (O, I / groups, kh, kw) int8, multiples of 2^-weight_frac_bits.
+        weight_frac_bits: the number of fractional bits of the weights.
+        bias: (O,) int8, multiples of 2^-bias_frac_bits.
+        bias_frac_bits: the number of fractional bits of the bias.
+        activation: applied to the sums.
+        window: strides, pads and dilations; if transposed, the strides enlarge and the pads crop.
+        groups: 1, or the number of channels of a depthwise convolution.
+        transposed: True for a transposed convolution.
     """
 
-    weight: np.ndarray  # (O, I / groups, kh, kw) int8
+    weight: np.ndarray
     weight_frac_bits: int
-    bias: np.ndarray  # (O,) int8
+    bias: np.ndarray
     bias_frac_bits: int
     activation: Activation = Activation.none
     window: Window = field(default_factory=Window)
@@ -148,8 +197,14 @@ class IntConv(OneInput):
 
 @dataclass(frozen=True)
 class IntCore:
-    """The integer core: operations in order with integer convolutions, the scale of every tensor,
-    and the host's part.
+    """The integer core: the part of a network that a DPU computes in int8, between the host's pre-
+    and post-processing.
+
+    Attributes:
+        ops: the operations in order. Convolutions hold integers.
+        frac_bits: the number n of fractional bits of each tensor by its name. The tensor's int8
+            integers are multiples of its scale 2^-n.
+        host_part: the computations of the host in front of the operations and behind them.
     """
 
     ops: tuple[IntConv | Op, ...]
@@ -157,23 +212,43 @@ class IntCore:
     host_part: HostPart = ONE_CHANNEL
 
     def scale(self, tensor: str) -> float:
-        """Return the value of one unit of a tensor, 2^-n."""
+        """Return the scale 2^-n of a tensor, which is the real value of the integer 1.
+
+        Args:
+            tensor: the name of the tensor.
+        """
         return float(2.0 ** -self.frac_bits[tensor])
 
     @property
     def convolutions(self) -> list[IntConv]:
-        """The operations that have weights."""
+        """The operations that have weights, in order."""
         return [op for op in self.ops if isinstance(op, IntConv)]
 
 
 def dequantized(op: Conv, int_op: IntConv) -> Conv:
-    """Return the float convolution with the values that the int8 weights and bias represent."""
+    """Return a float convolution with the real values that the int8 weights and bias represent.
+
+    Args:
+        op: the float convolution, whose other properties are unchanged.
+        int_op: the convolution in integers that `op` was rounded to.
+    """
     weight = (int_op.weight * 2.0**-int_op.weight_frac_bits).astype(np.float32)
     return replace(op, weight=weight, bias=int_op.float_bias.astype(np.float32))
 
 
 def rounded_to(values: np.ndarray, frac_bits: int) -> np.ndarray:
-    """Round real values to multiples of 2^-frac_bits, half up, and clip them to int8's range."""
+    """Round real values to an int8 scale, and return them as real values.
+
+    This is the DPU's rounding of activations: half up, as floor(x * 2^frac_bits + 1/2), then
+    clipping to [-128, 127].
+
+    Args:
+        values: float32 values of any shape.
+        frac_bits: the number n of fractional bits of the scale 2^-n.
+
+    Returns:
+        Multiples of 2^-n in the unit and shape of `values`.
+    """
     scale = np.float32(2.0**frac_bits)
     # np.rint would round half to even, as onnxruntime does.
     units = np.floor(values * scale + np.float32(0.5))
@@ -194,14 +269,24 @@ def build_core(
     host_part: HostPart = ONE_CHANNEL,
     earlier: RoundedConvs | None = None,
 ) -> IntCore:
-    """Quantise the weights of a graph, and move scales that the DPU's shifts cannot reach.
+    """Round the weights of a float graph to integers, and change scales where the DPU's shifts
+    cannot reach from one to the next.
 
     Args:
-        graph: a plane-reading graph.
-        frac_bits: the least-squares number of fractional bits of every activation.
-        shifts: the windows of the target.
-        host_part: the host part of the core.
-        earlier: convolutions of earlier calls, which are not rounded again; new ones are added.
+        graph: a float graph that reads the int8 planes that an image is split into (`PLANES`), not
+            the image itself.
+        frac_bits: the number of fractional bits wanted for each activation by its tensor's name,
+            such as those of least squared error.
+        shifts: the smallest and largest shifts that the target allows.
+        host_part: the host's pre- and post-processing, which becomes a part of the core.
+        earlier: the convolutions that earlier calls rounded. They are not rounded again, and new
+            ones are added. None starts without any.
+
+    Returns:
+        The integer core, all shifts of which the target allows.
+
+    Raises:
+        ModelError: the shifts do not reach all scales after ROUNDS rounds of changes.
     """
     earlier = {} if earlier is None else earlier
     legal = dict(frac_bits)
@@ -292,16 +377,17 @@ def _activation(op: Conv, frac_bits: int) -> Activation:
 def quantize_bias(
     bias: np.ndarray, product: int, shifts: Shifts = SHIFTS
 ) -> tuple[np.ndarray, int]:
-    """Quantise a bias (O,) to int8.
+    """Quantise a convolution's bias to int8, at a scale that a shift can align with the
+    accumulator.
 
     Args:
-        bias: in float.
-        product: fractional bits of the accumulator.
-        shifts: the windows of the target.
+        bias: (O,) the float bias.
+        product: the number of fractional bits of the accumulator: those of the weights plus those
+            of the input.
+        shifts: the smallest and largest shifts that the target allows.
 
     Returns:
-        The integers and their fractional bits, from which the accumulator can be reached by a
-        shift.
+        The integers (O,) int8, and their number of fractional bits.
     """
     # Any scale holds zeros; the accumulator's own needs no shift.
     best = best_frac_bits(bias) if bias.any() else product
@@ -328,8 +414,15 @@ def _tie(op: Op, frac_bits: dict[str, int]) -> None:
 
 
 def shift_faults(core: IntCore, shifts: Shifts = SHIFTS) -> list[str]:
-    """List every shift outside its window, one sentence each; the list is empty for a
-    legal core.
+    """List the shifts of a core that the DPU does not allow.
+
+    Args:
+        core: the integer core.
+        shifts: the smallest and largest shifts that the target allows.
+
+    Returns:
+        A sentence for each such shift, with the operation's name; empty for a core that the DPU
+        computes.
     """
     faults = []
     for op in core.ops:
@@ -342,7 +435,17 @@ def shift_faults(core: IntCore, shifts: Shifts = SHIFTS) -> list[str]:
 def op_shifts(
     op: IntConv | Op, frac_bits: Mapping[str, int], shifts: Shifts
 ) -> list[tuple[str, int, tuple[int, int]]]:
-    """Return (name, value, window) of each shift that an operation needs."""
+    """List the shifts that an operation needs, because its tensors have different scales.
+
+    Args:
+        op: an operation of a core.
+        frac_bits: the number of fractional bits of each tensor by its name.
+        shifts: the smallest and largest shifts that the target allows.
+
+    Returns:
+        For each shift its name, such as "shift_cut"; its value in bits; and the smallest and the
+        largest value allowed.
+    """
     inputs = [frac_bits[i] for i in op.inputs]
     output = frac_bits[op.output]
     if isinstance(op, Add):

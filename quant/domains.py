@@ -54,24 +54,27 @@ Functions = Collection[tuple[str, str]]
 
 
 def opset_of(model: ModelProto) -> int:
-    """Return the version of ONNX's own operators that a model has."""
+    """Return the version of ONNX's standard operators that a model imports; 1 if it states none."""
     versions = [opset.version for opset in model.opset_import if opset.domain in STANDARD]
     return max(versions, default=1)
 
 
 def functions_of(model: ModelProto) -> Functions:
-    """Return domain and name of each function that a file defines."""
+    """Return domain and name of each function that a file itself defines from ONNX's operators."""
     return {(function.domain, function.name) for function in model.functions}
 
 
 def operator_name(node: NodeProto, functions: Functions = ()) -> str:
-    """Return an operator's name, with its domain in front unless it is ONNX's or onnxruntime's on
-    integers.
+    """Return the name by which this project looks a node's operator up in its tables.
+
+    Operators of ONNX, and onnxruntime's operators on integers, have their bare names, such as
+    "Conv". Any other has its domain in front, such as "my.domain::Conv", so that it matches no
+    table.
 
     Args:
         node: the node of a file.
-        functions: the functions that the file defines; one may have the name of an operator of
-            ONNX.
+        functions: domain and name of each function that the file defines, as `functions_of` returns
+            them. A function may have the name of an operator of ONNX.
     """
     if (node.domain, node.op_type) in functions:
         return f"{node.domain}{SEPARATOR}{node.op_type}"
@@ -86,12 +89,24 @@ def operator_name(node: NodeProto, functions: Functions = ()) -> str:
 
 
 def is_foreign(name: str) -> bool:
-    """Return True if an operator of this name is neither ONNX's nor onnxruntime's on integers."""
+    """Return True if an operator is neither ONNX's nor one of onnxruntime's on integers.
+
+    Args:
+        name: the name of the operator, as `operator_name` returns it.
+    """
     return SEPARATOR in name
 
 
 def foreign_remedy(domain: str, op_type: str) -> str:
-    """Return advice for a user about a foreign operator."""
+    """Return advice for a user whose file has an operator that is not ONNX's own.
+
+    Args:
+        domain: the domain of the operator.
+        op_type: the name of the operator without its domain.
+
+    Returns:
+        A clause for a message, such as on how to write the file again.
+    """
     if op_type.startswith("Dynamic"):
         return FLOAT
     if "QuantizeLinear" in op_type or op_type == "FixNeuron":

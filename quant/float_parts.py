@@ -37,8 +37,10 @@ LAYERS = {
 
 
 def float_nodes(model: onnx.ModelProto) -> list[Node]:
-    """Return the nodes that compute in float: all except those on integers and those that only
-    define how integers are read.
+    """List the nodes of an INT8 file that compute in float.
+
+    All nodes count except those that compute on integers, and those that only define how integers
+    are read (QuantizeLinear and DequantizeLinear).
     """
     graph = OnnxGraph(model)
     integers = Integers(graph)
@@ -50,16 +52,27 @@ def float_nodes(model: onnx.ModelProto) -> list[Node]:
 
 
 def float_layers_check(model: onnx.ModelProto) -> Check:
-    """Return the check that an INT8 file computes no layer in float."""
+    """Return the check that an INT8 file computes no layer in float.
+
+    The check's value is the number of float nodes that have weights or contain a graph of their
+    own, and its limit is 0.
+    """
     layers = [str(node) for node in float_nodes(model) if node.op_type in LAYERS]
     return Check("layers computed in float", len(layers), 0, "layer", detail=", ".join(layers[:3]))
 
 
 def float_note(model: onnx.ModelProto) -> list[str]:
-    """Return a note that names the float operators of another quantiser's file.
+    """Return a note for the user that names the operators which another quantiser's file computes
+    in float.
 
-    In a file of this project they are the host part, which `encoding_faults` compares with the
-    integers node by node.
+    A file of this project gets none, because its float operators are the host part, which
+    `encoding_faults` compares node by node.
+
+    Args:
+        model: an INT8 network.
+
+    Returns:
+        A list of one sentence, or an empty list.
     """
     try:
         read_core(model)

@@ -31,12 +31,13 @@ SCALE = "of full scale"
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric by which a user judges results.
+    """A figure by which a user judges results, such as SSIM.
 
     Attributes:
         unit: the unit of the figure.
-        larger_is_better: whether a larger value is better.
-        value: function of a result (1, C, H, W) and its reference of the same shape.
+        larger_is_better: True if a larger value is better.
+        value: function of a result (1, C, H, W) and its reference of the same shape, both in shares
+            of full scale.
     """
 
     unit: str
@@ -57,7 +58,19 @@ METRICS: Mapping[str, Metric] = {
 
 
 def metric_value(name: str, result: np.ndarray, reference: np.ndarray) -> float:
-    """Return the value of a metric, by its name, for one result (1, C, H, W)."""
+    """Compare one result with its reference by a metric.
+
+    Args:
+        name: one of `METRICS`.
+        result: (1, C, H, W) in shares of full scale.
+        reference: the image that the result should be, of the same shape.
+
+    Returns:
+        The value in the unit of the metric.
+
+    Raises:
+        OptionError: the reference is not of the size of the result.
+    """
     if reference.size != result.size:
         raise OptionError(
             f"The `metric` {name!r} needs references of {times(result.shape)}, the size of the "
@@ -69,12 +82,13 @@ def metric_value(name: str, result: np.ndarray, reference: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class Spread:
-    """Differences of INT8 from float, patch by patch.
+    """Differences of INT8 from float over the patches that both networks were run on.
 
     Attributes:
-        counts: (2 * 4095 + 1,) pixels by their signed difference in whole DN, from -4095 on.
-        mae: (K,) mean absolute difference of each patch, of full scale.
-        largest: (K,) largest difference of each patch, of full scale.
+        counts: (2 * 4095 + 1,) the number of pixels for each difference INT8 - float, rounded to
+            integer digital numbers (DN, 4095 at full scale), from -4095 on.
+        mae: (K,) mean absolute difference of each of the K patches, as a share of full scale.
+        largest: (K,) largest absolute difference of each patch, as a share of full scale.
     """
 
     counts: np.ndarray
@@ -83,48 +97,53 @@ class Spread:
 
     @property
     def std_dn(self) -> float:
-        """Standard deviation in DN, of the differences in whole DN."""
+        """The standard deviation of the differences in DN, from the histogram of rounded
+        differences.
+        """
         dn = np.arange(-MAX_DN, MAX_DN + 1)
         mean = np.average(dn, weights=self.counts)
         return float(np.sqrt(np.average((dn - mean) ** 2, weights=self.counts)))
 
     def share_beyond(self, dn: int) -> float:
-        """Return the share of the pixels that differ by more than a number of integer DN."""
+        """Return the share of the pixels, in [0, 1], whose rounded difference exceeds `dn` digital
+        numbers.
+        """
         return 1 - float(self.counts[MAX_DN - dn : MAX_DN + dn + 1].sum() / self.counts.sum())
 
     def worst(self, count: int) -> list[int]:
-        """Return the patches of the largest MAE, the worst first."""
+        """Return the places of the `count` patches with the largest MAE, the worst first."""
         # Stable, so that patches of equal error keep their order.
         return [int(k) for k in np.argsort(-self.mae, kind="stable")[:count]]
 
 
 @dataclass(frozen=True)
 class GateResult:
-    """The measured differences between the INT8 and the float network, over all pixels.
+    """The measured differences between the INT8 and the float network, over all pixels of all
+    patches.
 
-    Differences are shares of full scale. PSNRs are in dB over full scale, and NaN without
-    references.
+    Differences are INT8 minus float, in shares of full scale. PSNRs are in dB over full scale, as
+    means over the patches, and NaN without references.
 
     Attributes:
-        mae: mean absolute difference of INT8 from float.
+        mae: mean absolute difference.
         std: standard deviation of the difference.
-        max_abs: its largest size.
-        p999: 99.9th percentile of its size.
-        psnr_between_db: PSNR of INT8 against float.
-        psnr_degraded_db: PSNR of the input against the reference.
-        psnr_float_db: PSNR of the float results.
-        psnr_int8_db: PSNR of the INT8 results.
-        patches: number of patches.
-        sample_range: the part of the range that the patches cover.
+        max_abs: largest absolute difference.
+        p999: 99.9th percentile of the absolute difference.
+        psnr_between_db: PSNR of the INT8 results against the float results, over all pixels.
+        psnr_degraded_db: PSNR of the inputs against the references.
+        psnr_float_db: PSNR of the float results against the references.
+        psnr_int8_db: PSNR of the INT8 results against the references.
+        patches: the number of patches.
+        sample_range: the part of the brightness range that the patches cover.
         spread: the differences patch by patch.
-        simulated: whether they are simulated, and not a user's own samples.
-        worst_drop_db: PSNR drop of the patch that loses most.
-        metric: the user's metric; empty for none.
-        metric_float: its value of the float results.
-        metric_int8: its value of the INT8 results.
-        input_change: mean absolute difference of the float results from their inputs; NaN where
-            these have another shape.
-        contrast: mean absolute deviation of the float results from their own means.
+        simulated: True for simulated patches, False for a user's own samples.
+        worst_drop_db: the largest PSNR drop from float to INT8 of one patch, in dB.
+        metric: the name of the user's metric; empty for none.
+        metric_float: the metric's mean value of the float results.
+        metric_int8: the metric's mean value of the INT8 results.
+        input_change: mean absolute difference of the float results from their inputs; NaN if they
+            differ in shape.
+        contrast: mean absolute deviation of the float results from the mean of their patch.
     """
 
     mae: float
@@ -153,32 +172,35 @@ class GateResult:
 
     @property
     def metric_loss(self) -> float:
-        """The loss of INT8 by the user's metric; above 0 it is worse than float."""
+        """The amount by which INT8 is worse than float in the metric's unit; negative if it is
+        better.
+        """
         drop = self.metric_float - self.metric_int8
         return drop if METRICS[self.metric].larger_is_better else -drop
 
     @property
     def source(self) -> str:
-        """A description of the samples that the figures come from."""
+        """A description of the samples that the figures come from, such as "64 samples"."""
         kind = "simulated patches of 128 x 128" if self.simulated else "samples"
         return f"{self.patches} {kind}"
 
     @property
     def drop_db(self) -> float:
-        """PSNR that INT8 loses against the reference."""
+        """The PSNR in dB that INT8 loses against the reference: that of float less that of INT8."""
         return self.psnr_float_db - self.psnr_int8_db
 
     @property
     def gain_db(self) -> float:
-        """PSNR that the float network gains over its input."""
+        """The PSNR in dB against the reference that the float network gains over its input."""
         return self.psnr_float_db - self.psnr_degraded_db
 
     @property
     def std_over_mae(self) -> float:
-        """Standard deviation over MAE: 1.25 for rounding, whose errors are nearly Gaussian, and
-        more with clipping.
+        """The standard deviation of the difference over the MAE, which shows whether values were
+        clipped.
 
-        It is 0 if there is no difference.
+        Rounding, whose errors are nearly Gaussian, makes it 1.25; clipping makes it larger. It is 0
+        if there is no difference.
         """
         return 0.0 if self.mae == 0 else self.std / self.mae
 
@@ -189,24 +211,29 @@ def compare(
     patches: Patches,
     metric: str = "",
 ) -> GateResult:
-    """Run both networks on patches; images are clipped as in a file.
+    """Run the float and the INT8 network on patches, and measure how their results differ.
 
-    Images of other ranges than [0, 1] are compared as shares of these. The patches' own ranges
-    count, because an INT8 file that stated a wide one would make its errors small.
-
-    Without references, or if they differ in size from the results, the PSNRs to them are NaN.
+    Results that are images are clipped to [0, 1], as a file would store them. If images have other
+    ranges than [0, 1], shares of these ranges are compared. The ranges are those of the patches and
+    not those that the INT8 file states, because a wide stated range would make its errors look
+    small.
 
     Args:
-        float_session: the float network's.
-        int8_session: the INT8 network's.
-        patches: the patches that both are run on.
-        metric: one of `METRICS`, by which results are also compared with the references.
+        float_session: an onnxruntime session of the float network.
+        int8_session: an onnxruntime session of the INT8 network.
+        patches: the images that both are run on, with their references.
+        metric: one of `METRICS`, by which both results are also compared with the references; empty
+            for none.
+
+    Returns:
+        The differences over all patches. PSNRs against the references are NaN if there are no
+        references, or if they differ in size from the results.
 
     Raises:
-        ModelError: results of different shapes.
-        ImageError: a reference of the results' size outside [0, 1], or a sample without one if
-            others have it.
-        OptionError: references that the metric does not accept.
+        ModelError: the results of the networks differ in shape, or are no images (N, C, H, W).
+        ImageError: a reference of the results' size is outside [0, 1], or a sample has none of this
+            size while others do.
+        OptionError: the metric needs references of the size of the results.
     """
     counts = np.zeros(BINS, np.int64)
     dn_counts = np.zeros(2 * MAX_DN + 1, np.int64)
@@ -312,12 +339,13 @@ def _name(patches: Patches, number: int) -> str:
 
 
 def unfit_reference(patches: Patches, number: int, purpose: str) -> ImageError:
-    """Return the error of a reference that differs in size from the network's results.
+    """Build the error for a sample whose reference is missing or differs in size from the network's
+    result.
 
     Args:
         patches: the samples.
-        number: the number of the sample.
-        purpose: the purpose that needs the reference, for the message.
+        number: the place of the sample among them.
+        purpose: what needs the reference, for the message, such as "the mean PSNR".
     """
     shape = patches.pairs[number][1].shape
     fault = f"its reference has {times(shape[1:])}" if math.prod(shape) else "it has none"
@@ -333,12 +361,12 @@ def _psnr_db(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 def gate_row(result: GateResult, shares: Mapping[str, float] | None = None) -> Row:
-    """Return the effect of INT8 as a row of the table "gate".
+    """Return the effect of INT8 as the one row of the table "gate".
 
     Args:
-        result: the measurements.
-        shares: for each layer the share of its results at the ends of 8 bits, which a gate also
-            prints.
+        result: the measured differences.
+        shares: for each layer, by name, the share of its results at the ends of 8 bits. If given,
+            the row also states the largest of them and the PSNR drop.
     """
     entries = {
         "MAE": (result.mae, SCALE),
@@ -369,13 +397,14 @@ def gate_row(result: GateResult, shares: Mapping[str, float] | None = None) -> R
 
 
 def figure_of(value: float, unit: str, source: str, missing: str) -> Figure:
-    """Return a measured value as a figure, or an unavailable one if it is infinite or NaN.
+    """Return a measured value as a figure for a table; an infinite or NaN value becomes an
+    unavailable one.
 
     Args:
-        value: in the unit.
+        value: the value in the unit. Infinity is taken for the PSNR of identical images.
         unit: the unit of the figure.
-        source: how it was measured.
-        missing: why it is NaN.
+        source: how the value was measured.
+        missing: the reason that the figure states if the value is NaN.
     """
     if math.isinf(value):
         return unavailable(unit, "infinite: the two images are identical")

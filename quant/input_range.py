@@ -36,17 +36,17 @@ as values of another scale.
 
 
 def read_ranges(option: object, channels: int) -> Ranges:
-    """Return the ranges that a user states.
+    """Read the ranges of a network's input that a user states.
 
     Args:
         option: text LOW,HIGH or such a pair for each channel, or an array of the same numbers.
         channels: the number of the network's channels.
 
     Returns:
-        One pair for each channel; empty if all are [0, 1].
+        A pair (low, high) for each channel; empty if all are [0, 1].
 
     Raises:
-        OptionError: other text, another number of pairs, or ends that are no range.
+        OptionError: the option has another form or another number of pairs, or a pair is no range.
     """
     try:
         numbers = option.split(",") if isinstance(option, str) else np.ravel(option)  # type: ignore[call-overload]
@@ -80,8 +80,10 @@ def require_ranges(ranges: Iterable[tuple[float, ...]]) -> None:
 
 
 def is_range(low: float, high: float) -> bool:
-    """Return True if `low` < `high` and the larger absolute value of the two is within SIZES, the
-    smallest and the largest size that a range may have.
+    """Return True if two numbers can be the ends of a channel's input range.
+
+    The lower end must be below the higher one, and the larger absolute value of the two must be
+    within SIZES.
     """
     # NaN fails every comparison, so it is refused as well.
     return low < high and SIZES[0] <= largest_size(low, high) <= SIZES[1]
@@ -116,7 +118,7 @@ def ranges_of(images: Iterable[np.ndarray]) -> Ranges:
 
 
 def ranges_of_result(result: np.ndarray, image: np.ndarray, ranges: Ranges) -> Ranges:
-    """Return the ranges of which a result is compared in shares.
+    """Return the ranges relative to which a network's result is compared, so that 1 is full scale.
 
     1. A network may read normalised pixels and return an image in [0, 1], of which shares of the
        input's range would hide errors: such a result has the range [0, 1].
@@ -127,8 +129,8 @@ def ranges_of_result(result: np.ndarray, image: np.ndarray, ranges: Ranges) -> R
 
     Args:
         result: the result of the float network, (1, C', H', W').
-        image: (1, C, H, W) from which it was computed.
-        ranges: the ranges of the image's channels; empty where all are [0, 1].
+        image: the image (1, C, H, W) from which the result was computed.
+        ranges: the range (low, high) of each channel of the image; empty if all are in [0, 1].
     """
     if share_within(result, *AROUND_UNIT) >= NEARLY_ALL:
         return ranges if share_within(image, *AROUND_UNIT) >= NEARLY_ALL else ()
@@ -141,7 +143,7 @@ def ranges_of_result(result: np.ndarray, image: np.ndarray, ranges: Ranges) -> R
 
 
 def share_within(values: np.ndarray, low: float, high: float) -> float:
-    """Return the share of the values from `low` to `high`."""
+    """Return the share of the values, in [0, 1], that lie from `low` to `high`, both included."""
     return float(((values >= low) & (values <= high)).mean())
 
 
@@ -186,7 +188,12 @@ def _ends(values: np.ndarray, ranges: Ranges) -> np.ndarray:
 
 
 def in_words(ranges: Ranges) -> str:
-    """Return ranges as text for messages, once if all are equal."""
+    """Format ranges as text for messages, such as "-1 to 1".
+
+    Args:
+        ranges: the ranges of a network's channels, at least one. They are stated once if all are
+            equal.
+    """
     return ", ".join(
         f"{low:g} to {high:g}" for low, high in (ranges if len(set(ranges)) > 1 else ranges[:1])
     )

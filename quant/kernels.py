@@ -37,8 +37,13 @@ UINT8_MAX = 255
 
 
 class Places(NamedTuple):
-    """The inputs at which an operator has its activations' zero point, its weights, their zero
-    point and the zero point of its result.
+    """The numbers of an integer operator's inputs that hold zero points and weights.
+
+    Attributes:
+        zero: the input with the zero point of the activations.
+        weight: the input with the weights.
+        weight_zero: the input with the zero point of the weights.
+        result_zero: the input with the zero point of the result; None for a result in int32.
     """
 
     zero: int
@@ -70,7 +75,11 @@ zero point of that result.
 
 
 def with_exact_sums(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Return the model with the same results on kernels that saturate.
+    """Return an INT8 model that computes the same integers on a processor whose int8 kernels
+    saturate.
+
+    `quant.session.open_session` calls it on such a processor. The description of the module says
+    which operators are rewritten.
 
     Args:
         model: an INT8 network; not changed.
@@ -88,9 +97,11 @@ def with_exact_sums(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def cannot_saturate(kind: str, weight: np.ndarray, largest: int) -> bool:
-    """Return True if no pair of neighbouring products can leave int16.
+    """Return True if an int8 kernel that adds neighbouring products in int16 computes a layer
+    exactly.
 
-    This holds for any activations from 0 to `largest`.
+    That is so if no pair of neighbouring weights can leave int16, for any activations from 0 to
+    `largest`.
 
     Args:
         kind: the ONNX operator.
@@ -273,11 +284,12 @@ FIRST_OPSET = 11
 
 
 def with_wide_convolutions(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Return the model with channels of zeros added to narrow integer convolutions, which
-    onnxruntime computes faster.
+    """Return the model with channels of zeros added to integer convolutions that have few channels.
+
+    onnxruntime computes these faster with more channels (FEWEST_OUTPUTS). The results are the same.
 
     Args:
-        model: any network; not changed.
+        model: any network; not changed. One without integer convolutions is returned as it is.
     """
     has_integers = any(node.op_type == "QLinearConv" for node in model.graph.node)
     if not has_integers or opset_of(model) < FIRST_OPSET:

@@ -24,7 +24,9 @@ MAE_GROWTH = 1.05
 
 @dataclass(frozen=True)
 class Limits:
-    """The largest values allowed; None for no limit. Differences and shares in [0, 1], PSNRs in dB.
+    """The limits of the gate: how much an INT8 network may differ from its float network at most.
+
+    None sets no limit. Differences and shares are in [0, 1], PSNRs in dB.
 
     Attributes:
         mae: mean absolute difference of INT8 from float. The default suits networks that change an
@@ -38,10 +40,10 @@ class Limits:
             the results.
         psnr_drop_db: PSNR lost against the reference.
         min_psnr_float_int8_db: smallest PSNR of INT8 against float.
-        metric_loss: loss of INT8 by the chosen metric.
+        metric_loss: loss of INT8 by the metric that the user chose, in the metric's unit.
         saturated: largest share of a layer's results at the ends of 8 bits.
-        mae_growth: MAE as a multiple of a stored baseline's; 1.05 if there is a baseline and no
-            such limit.
+        mae_growth: MAE as a multiple of the MAE of a stored baseline, which is an earlier run of
+            the gate; 1.05 if there is a baseline and this is None.
 
     Examples:
         >>> bd.Limits(psnr_drop_db=0.2).mae
@@ -82,14 +84,20 @@ def limits_of(
     source: "Limits | Mapping[str, float] | str | os.PathLike[str] | None",
     max_mae: float | None = None,
 ) -> Limits:
-    """Read the limits of a TOML file or a mapping; limits that are missing have their defaults.
+    """Read the limits of the gate from a TOML file or a mapping; limits that are missing have their
+    defaults.
 
     Args:
-        source: limits, a mapping or a TOML file such as `mae = 0.0007`; the defaults if None.
-        max_mae: overrides the limit of the MAE.
+        source: limits by name, or a TOML file with lines such as `mae = 0.0007`. A `Limits` is used
+            as it is, and None has the defaults.
+        max_mae: overrides the limit of the mean absolute error, as a share of full scale.
+
+    Returns:
+        The limits, each of which a broken network would exceed.
 
     Raises:
-        OptionError: no limits, unknown ones, or some that no network breaks.
+        OptionError: the source is empty or cannot be read, names an unknown limit, or has a value
+            so wide that even a network that returns a black image would pass.
     """
     where = "`limits`"
     values: Mapping[str, object]
@@ -149,14 +157,17 @@ def judge(
     baseline_mae: float | None = None,
     shares: Mapping[str, float] | None = None,
 ) -> list[Check]:
-    """Check every limit that is set.
+    """Compare the measured effect of INT8 with every limit that is set.
 
     Args:
-        result: the measured effect of INT8.
+        result: the measured differences between the INT8 and the float network.
         limits: the largest values allowed.
-        baseline_mae: the MAE of an earlier gate, if there is a baseline.
-        shares: for each layer the share of its results at the ends of 8 bits. With None it is not
-            checked; without 8-bit tensors its limit is not met.
+        baseline_mae: the MAE that an earlier run of the gate stored, if there is a baseline.
+        shares: for each layer, by name, the share of its results at the ends of 8 bits. With None
+            this is not checked. If it is empty, because no tensor has 8 bits, the limit is not met.
+
+    Returns:
+        One check for each limit that is set, with the measured value and the limit.
     """
     figures: list[tuple[str, float, float | None, str, str]] = [
         ("MAE", result.mae, limits.mae, "of full scale", ""),

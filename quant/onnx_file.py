@@ -44,17 +44,21 @@ REMEDY = (
 def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
     """Read an ONNX model with its external weights; every file is read by this function.
 
-    A float network is simplified (`quant.simplify`), an INT8 one is returned unchanged. So is a
-    model that is only inspected.
+    A float network is simplified (`quant.simplify`), and an INT8 network is returned unchanged. If
+    a model is only inspected, and cannot be simplified, it is returned unchanged too.
 
     Args:
         path: the file.
-        to_run: whether a runtime may open it; False if its nodes are only inspected, from any
-            domain.
+        to_run: True if a runtime will open the model, which must then have ONNX's own operators.
+            False if its nodes are only inspected; they may be of any domain.
+
+    Returns:
+        The model, with all weights in memory.
 
     Raises:
-        ModelError: missing, empty, not ONNX, of weights that are not finite, or not to be trusted
-            (see `quant.untrusted` and `quant.onnx.runnable`).
+        ModelError: the file is missing, empty or not ONNX, has weights that are not finite, was
+            exported in training mode, or cannot be trusted (see `quant.untrusted` and
+            `quant.onnx.runnable`).
     """
     try:
         content = read_whole(path, FILE_BYTES)
@@ -67,8 +71,14 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
 
 
 def read_onnx(content: bytes, where: str) -> onnx.ModelProto:
-    """Read a network from bytes as `load_onnx` does from a file; the bytes must contain all
-    weights.
+    """Read a network from bytes, with the checks and the simplification of `load_onnx`.
+
+    Args:
+        content: the bytes of an ONNX file that contains all its weights.
+        where: name of the network for messages, such as "a.onnx".
+
+    Raises:
+        ModelError: the bytes are not ONNX, are of a network in training mode, or cannot be trusted.
     """
     return _simplified(parse_onnx(content, where), where, True)
 
@@ -95,9 +105,12 @@ def parse_onnx(
     Args:
         content: the bytes of the file.
         where: name of the network for messages.
-        to_run: whether a runtime will open it.
-        path: the path of the file, next to which weights may be stored; None if all are in
-            `content`.
+        to_run: True if a runtime will open the model, False if its nodes are only inspected.
+        path: the path of the file, in whose folder weights may be stored; None if `content` has
+            them all.
+
+    Raises:
+        ModelError: the bytes are not ONNX, or cannot be trusted.
     """
     if not content:
         raise ModelError(f"{where} is an empty file. {REMEDY}")
@@ -130,33 +143,42 @@ def parse_onnx(
 
 
 def require_onnx_name(*paths: Path | None) -> None:
-    """Raise OptionError if the name of an output does not end in .onnx."""
+    """Raise OptionError if the name of a file to write does not end in .onnx.
+
+    Args:
+        paths: the files; None is skipped.
+    """
     for path in paths:
         if path is not None and path.suffix.lower() != ".onnx":
             raise OptionError(f"The name of the output must end in .onnx, got {path}.")
 
 
 def save_onnx(model: onnx.ModelProto, path: Path) -> None:
-    """Check a model and write it, whole or not at all."""
+    """Check a model, and write it to a file completely or not at all.
+
+    Args:
+        model: the model.
+        path: the file, which is replaced if it exists.
+    """
     onnx.checker.check_model(model)
     with whole_file(path) as temporary:
         onnx.save_model(model, temporary)
 
 
 def metadata(model: onnx.ModelProto) -> dict[str, str]:
-    """Return the key-value pairs of a model's metadata."""
+    """Return the metadata that a model's file states, as text by key."""
     return {item.key: item.value for item in model.metadata_props}
 
 
 def make_model(
     graph: onnx.GraphProto, about: dict[str, str], microsoft: bool = False
 ) -> onnx.ModelProto:
-    """Build a model of this project's opset around a graph.
+    """Build a model around a graph, with the ONNX versions that this project writes.
 
     Args:
         graph: the graph.
-        about: metadata of the model.
-        microsoft: whether to add onnxruntime's own operator domain.
+        about: the metadata of the model, by key.
+        microsoft: True to import onnxruntime's own operators (the domain com.microsoft) as well.
     """
     opsets = [onnx.helper.make_opsetid("", OPSET)]
     opsets += [onnx.helper.make_opsetid(MICROSOFT, 1)] if microsoft else []
@@ -168,7 +190,11 @@ def make_model(
 
 
 class GraphWriter:
-    """Collects the nodes and the constants of a graph; each constant is stored once by its name."""
+    """A graph under construction: nodes in order, and constants that are stored once by their name.
+
+    Attributes:
+        domain: the domain that nodes state; None leaves it out, which means ONNX's own.
+    """
 
     domain: str | None = None
     """The domain of operators that state none; the empty one is ONNX's own, stated explicitly."""
@@ -186,12 +212,12 @@ class GraphWriter:
         domain: str | None = None,
         **attributes: int | float | str | list[int],
     ) -> str:
-        """Append an operator with one result, and return the name of the result.
+        """Append a node with one result, and return the name of the result.
 
         Args:
             kind: the operator.
-            output: name of the result.
-            inputs: names of its inputs.
+            output: the name of the result.
+            inputs: the names of the tensors that the node reads.
             name: the name of the node; that of the result if empty.
             domain: the domain of the operator; None for the domain of the writer.
             attributes: the attributes of the node.
@@ -206,25 +232,38 @@ class GraphWriter:
         return output
 
     def constant(self, name: str, value: np.ndarray) -> str:
-        """Note a constant, and return its name."""
+        """Store a constant under a name, unless that name has one already, and return the name."""
         self.weights.setdefault(name, numpy_helper.from_array(value, name))
         return name
 
     def unit(self, frac_bits: int) -> str:
-        """Add the constant 2^-frac_bits, one unit of a tensor, and return its name."""
+        """Add the scale 2^-frac_bits as a float32 constant, and return its name."""
         return self.constant(f"scale_2^{-frac_bits}", np.array(2.0**-frac_bits, np.float32))
 
     def graph(
         self, name: str, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
     ) -> onnx.GraphProto:
-        """Build the ONNX graph of the nodes and constants collected so far."""
+        """Build the ONNX graph of the nodes and constants collected so far.
+
+        Args:
+            name: the name of the graph.
+            inputs: type and shape of each input, such as `image_info` describes them.
+            outputs: type and shape of each output.
+        """
         return onnx.helper.make_graph(
             self.nodes, name, inputs, outputs, list(self.weights.values())
         )
 
 
 def image_info(name: str, channels: int, tile_px: int | None) -> onnx.ValueInfoProto:
-    """Describe a tensor (N, channels, H, W): a fixed tile of one image, or any number and size."""
+    """Describe an input or output of a graph that is an image (N, channels, H, W) float32.
+
+    Args:
+        name: the name of the tensor.
+        channels: the number of its channels.
+        tile_px: rows and columns of the one image that the tensor is fixed to; None leaves number
+            and size of the images free.
+    """
     shape: list[str | int | None] = (
         [1, channels, tile_px, tile_px] if tile_px else ["N", channels, "H", "W"]
     )
@@ -232,7 +271,12 @@ def image_info(name: str, channels: int, tile_px: int | None) -> onnx.ValueInfoP
 
 
 def with_outputs(model: onnx.ModelProto, kinds: Mapping[str, int]) -> onnx.ModelProto:
-    """Return the model with these tensors, of these ONNX types, as additional outputs."""
+    """Return a copy of a model that also returns some of its inner tensors.
+
+    Args:
+        model: any model; not changed.
+        kinds: ONNX's number of the element type of each tensor, by the tensor's name.
+    """
     extended = deepcopy(model)
     names = {value.name for value in extended.graph.output}
     extended.graph.output.extend(
@@ -248,10 +292,18 @@ OUTPUT = "output"
 
 
 def with_one_output(model: onnx.ModelProto, name: str, where: str) -> onnx.ModelProto:
-    """Return the network with one of its outputs, and only the nodes that compute it.
+    """Return a network that has only one of its outputs, and only the nodes that compute it.
+
+    Args:
+        model: a network with several outputs; not changed.
+        name: the output that remains.
+        where: name of the network for messages.
+
+    Returns:
+        The network, simplified if it is a float one. Its metadata record the output's name.
 
     Raises:
-        OptionError: no such output.
+        OptionError: the network has no output of this name.
     """
     values = {value.name: value for value in model.graph.output}
     if name not in values:
@@ -274,7 +326,12 @@ def with_one_output(model: onnx.ModelProto, name: str, where: str) -> onnx.Model
 
 
 def fixed_tile_px(model: onnx.ModelProto) -> int | None:
-    """Return the tile side that a model is fixed to, or None if it accepts any size."""
+    """Return the side in pixels of the square image that a model is fixed to, or None if it accepts
+    any size.
+
+    Raises:
+        ModelError: the model has not exactly one input (N, C, H, W), or H and W differ.
+    """
     sizes = []
     if model.graph.input:
         sizes = [d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim]
@@ -288,10 +345,13 @@ def fixed_tile_px(model: onnx.ModelProto) -> int | None:
 
 
 def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Return a network that is fixed to one tile as a network for any size.
+    """Return a network that is fixed to one size of image as a network for images of any size.
 
-    Only networks whose inputs and outputs have four sizes can be changed; others are returned
-    unchanged.
+    Only networks whose inputs and outputs all have the axes (N, C, H, W) can be changed. Others are
+    returned unchanged.
+
+    Args:
+        model: a network; not changed.
     """
     if fixed_tile_px(model) is None:
         return model
@@ -309,7 +369,9 @@ def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def is_quantized(model: onnx.ModelProto) -> bool:
-    """Return True if any node reads, writes or computes with quantised numbers."""
+    """Return True if a network is an INT8 one: any node reads, writes or computes with quantised
+    numbers.
+    """
     kinds = {node.op_type.lower() for node in model.graph.node}
     marks = ("qlinear", "quantizelinear", "integer")
     return any(mark in kind for kind, mark in product(kinds, marks))
@@ -317,9 +379,13 @@ def is_quantized(model: onnx.ModelProto) -> bool:
 
 @contextmanager
 def faults_named(label: str) -> Iterator[None]:
-    """Put the name of a network in front of a ModelError that does not state it.
+    """Put the name of a network in front of a ModelError that is raised within the block.
 
-    Functions that work on a model in memory do not know the name of its file.
+    Functions that work on a model in memory do not know the name of its file. A message that states
+    the name already is not changed.
+
+    Args:
+        label: the name of the network, such as that of its file.
     """
     try:
         yield
@@ -331,7 +397,15 @@ def faults_named(label: str) -> Iterator[None]:
 
 
 def require_quantized(model: onnx.ModelProto, name: str, expected: bool) -> None:
-    """Raise ModelError if the float and the INT8 network are swapped."""
+    """Raise ModelError unless a network is of the expected kind, float or INT8.
+
+    This detects that a user gave the float and the INT8 file in the wrong order.
+
+    Args:
+        model: the network.
+        name: the name of the network, with which the message begins.
+        expected: True for an INT8 network, False for a float one.
+    """
     if is_quantized(model) != expected:
         kinds = ("a float network", "an INT8 network")
         raise ModelError(

@@ -61,12 +61,12 @@ STEPS: Mapping[str, tuple[tuple[int, ...] | None, bool, bool]] = {
 
 @dataclass(frozen=True)
 class Grid:
-    """A uniform quantization grid: the multiples of `scale` from `low` to `high` times it.
+    """The values that a rounded tensor may have: scale times each integer from `low` to `high`.
 
     Attributes:
-        scale: distance between neighbouring values of the grid, in the tensor's unit.
-        low: the smallest multiple, or minus infinity if the grid has no lower end.
-        high: the largest multiple, or infinity if the grid has no upper end.
+        scale: distance between neighbouring values, in the tensor's unit.
+        low: the smallest integer, or minus infinity if the grid has no lower end.
+        high: the largest integer, or infinity if the grid has no upper end.
     """
 
     scale: float
@@ -76,27 +76,29 @@ class Grid:
 
 @dataclass(frozen=True)
 class Cost:
-    """The loss of a step, as the mean over the samples.
+    """The loss of a network with some restrictions of a DPU against the float network, as mean over
+    samples.
 
     Attributes:
         mae: mean absolute difference from the float network's result, in shares of the input's
             range.
-        drop_db: PSNR of the float network less that of the step, in dB against the references; NaN
-            without references.
+        drop_db: PSNR of the float network less that of the restricted one, in dB against the
+            references; NaN without references.
     """
 
     mae: float
     drop_db: float
 
     def beyond(self, before: "Cost", source: str) -> Figure:
-        """Return the loss that was added to that of another step.
+        """Return the loss that one more restriction adds to the loss before it, as a figure.
 
         Args:
-            before: the loss of the step before this one.
+            before: the loss with the restrictions before this one.
             source: how both were measured, for the figure.
 
         Returns:
-            The added loss in dB if both have references, else the added mean absolute difference.
+            The added loss in dB if both have references, else the added mean absolute difference as
+            a share of full scale.
         """
         if math.isfinite(self.drop_db) and math.isfinite(before.drop_db):
             return measured(self.drop_db - before.drop_db, "dB", source)
@@ -105,13 +107,15 @@ class Cost:
 
 @dataclass(frozen=True)
 class Measured:
-    """Samples that steps are measured on.
+    """Samples on which restrictions of a DPU are measured, with the float network's results for
+    them.
 
     Attributes:
-        pairs: the pairs of an image and its reference, which may be empty.
-        floats: results of the float network.
-        ranges: the smallest and the largest value of each of its tensors, and 0.
-        host_part: the host's part.
+        pairs: the pairs of an image and its reference. A reference may be an empty array.
+        floats: the float network's result for each image.
+        ranges: the smallest and the largest value of each tensor of the float network by name, over
+            all samples and 0.
+        host_part: the host's pre- and post-processing, which all steps share.
     """
 
     pairs: Sequence[Pair]
@@ -121,10 +125,10 @@ class Measured:
 
     @classmethod
     def of(cls, result: Quantized, pairs: Sequence[Pair]) -> "Measured":
-        """Run the float network on the samples, and record its results and its tensors' ranges.
+        """Run the float network on samples, and record its results and the ranges of its tensors.
 
         Args:
-            result: the INT8 network, which knows the float one.
+            result: the quantised network, which also holds the float one.
             pairs: images (1, C, H, W) in the network's units, each with its reference or an empty
                 array.
         """
@@ -144,14 +148,14 @@ class Measured:
         return cls(pairs, floats, dict(zip(names, limits, strict=True)), host_part)
 
     def corrections(self, graph: Graph, grids: Mapping[str, Grid]) -> Iterator[np.ndarray]:
-        """Yield the results of a plane-reading graph whose tensors are rounded to grids.
+        """Run a float graph with some tensors rounded to grids, on all samples.
 
         Args:
-            graph: a float graph that reads the planes instead of the image.
+            graph: a float graph that reads the int8 planes that an image is split into.
             grids: the grid of each rounded tensor by name. Other tensors stay in float.
 
         Yields:
-            The correction of each image, (1, C, H', W') float32, as the graph computes it.
+            The result for each image, (1, C, H', W') float32, before the host adds the image.
         """
         model = rounded_model(graph_to_onnx(graph, [CORRECTION], self.host_part.planes), grids)
         session = open_session(model)
@@ -190,12 +194,13 @@ class Measured:
     def cost_of_step(
         self, graph: Graph, axes: tuple[int, ...] | None, zero_point: bool, powers: bool
     ) -> Cost:
-        """Return the loss of a float graph whose weights and tensors are rounded to grids.
+        """Return the loss of the float network with weights and tensors rounded as one step of the
+        module says.
 
         Args:
             graph: the float network, which reads the image.
-            axes: axes of weights (O, I, kh, kw) over which a scale is shared; None shares one scale
-                over all of them.
+            axes: the axes of weights (O, I, kh, kw) over which a scale is shared; None shares one
+                scale over all of them.
             zero_point: if True, the grid of a tensor reaches from its smallest to its largest
                 value. Otherwise it lies around 0.
             powers: if True, scales are rounded up to powers of two.
@@ -215,10 +220,10 @@ class Measured:
         return self.cost(self.host_part.finish(image, each) for (image, _), each in pairs)
 
     def cost_of_integers(self, result: Quantized, clips: bool) -> Cost:
-        """Return the loss of the INT8 network's own integers and scales.
+        """Return the loss of the integers and scales of an INT8 network, with or without clipping.
 
         Args:
-            result: the INT8 network.
+            result: the quantised network.
             clips: if True, tensors are clipped to int8. Otherwise their integers have no limits, so
                 that the difference of both losses is the loss by clipping.
         """
@@ -234,15 +239,16 @@ class Measured:
 
 
 def price_rows(result: Quantized, held_out: Patches) -> list[Row]:
-    """Return a row for the loss of each step, and one for the cost of clipping in the last.
+    """Measure the loss that each restriction of a DPU adds, from the float network to INT8, as
+    table rows.
 
     Args:
-        result: the INT8 network, with its float one.
+        result: the quantised network, which also holds the float one.
         held_out: samples that are held out from calibration. At most SAMPLES of them are measured.
 
     Returns:
-        Rows of the table "price", in the order of the steps. "price" is the loss that a step adds
-        to the step before it.
+        Rows of the table "price": one for each step of the module in order, and one for clipping in
+        the last step. Their figure "price" is the loss that a step adds to the step before it.
     """
     samples = Measured.of(result, list(islice(held_out.pairs, SAMPLES)))
     graph = result.network.graph

@@ -96,10 +96,12 @@ class Quantized:
     """A quantised network.
 
     Attributes:
-        host: the ONNX file for the host, with the core and the host's part.
-        core: the integer core.
-        graph: the float graph that was rounded to `core`.
-        network: the float network before any pass.
+        host: the INT8 network as ONNX for onnxruntime: the integer core, and the host's pre- and
+            post-processing.
+        core: the integer core, which the DPU computes.
+        graph: the float graph that was rounded to `core`, after the passes (equalized, with copies
+            of its result).
+        network: the float network before any pass, split into DPU and host part.
     """
 
     host: onnx.ModelProto
@@ -110,14 +112,17 @@ class Quantized:
 
 @dataclass(frozen=True)
 class Plan:
-    """The parts of a quantisation.
+    """A float network and everything that decides how it becomes an integer core.
+
+    `rounded` carries a plan out on calibration images.
 
     Attributes:
-        graph: a float graph that reads the planes.
-        host_part: the host's part.
-        groups: residual groups, each of one scale.
-        singles: tensors that are equalized in addition to the groups, or without groups.
-        shifts: the windows of the target.
+        graph: a float graph that reads the int8 planes that an image is split into instead of the
+            image.
+        host_part: the host's pre- and post-processing.
+        groups: residual groups, each a set of tensors that adds connect and that share one scale.
+        singles: tensors whose channels are equalized in addition to the groups, or without groups.
+        shifts: the smallest and largest shifts that the target allows.
         passes: the passes that reduce the error.
         effort: the effort of the search for equalization factors.
     """
@@ -131,7 +136,11 @@ class Plan:
     effort: Effort = Effort.normal
 
     def stages(self) -> list[Stage]:
-        """Return the stages of the search for equalization factors."""
+        """Return the separate searches for equalization factors, in order: the residual groups,
+        then the single tensors.
+
+        Effort and time of the search are estimated from them before it begins.
+        """
         groups = self.groups if self.passes.equalization else []
         widths = channels_of(self.graph, {PLANES: self.host_part.planes})
         stages = [
@@ -149,10 +158,17 @@ class Plan:
         """Round a float graph to an integer core.
 
         Args:
-            candidate: `graph`, equalized or with copies of its result.
-            frac_bits: least-squares scale of each tensor, as its number of fractional bits.
-                Equalized tensors get GROUP_FRAC_BITS instead.
-            earlier: convolutions that were rounded before, which are not rounded again.
+            candidate: the plan's graph after some passes: equalized, or with copies of its result.
+            frac_bits: the number of fractional bits of the scale of least squared error, for each
+                tensor by its name. Equalized tensors get GROUP_FRAC_BITS instead.
+            earlier: convolutions that were rounded before, which are not rounded again; new ones
+                are added.
+
+        Returns:
+            The integer core.
+
+        Raises:
+            ModelError: the DPU's shifts do not reach all scales.
         """
         # Equalized tensors are scaled to fill int8 at one scale.
         shared = [*chain.from_iterable(self.groups), *self.singles.tensors]
@@ -175,21 +191,20 @@ def quantize_model(
     """Quantise a float network under the DPU's rules: int8, symmetric, per tensor, power-of-two
     scales.
 
-    A global add remains on the host, in 12 bits. Then only the correction that is added to the
-    image is computed in int8.
+    If the network adds its input image to the result (a global add), the host does so in 12 bits.
+    Then only the correction that is added to the image is computed in int8.
 
     Args:
-        model: the float network.
+        model: the simplified float network.
         patches: the calibration patches.
-        about: metadata of the files.
-        shifts: the ranges of shifts that the target allows.
+        about: metadata that the INT8 file gets, by key, in addition to that of the float file.
+        shifts: the smallest and largest shifts that the target allows.
         tuning: the parameters of fine-tuning; None does not train the integers.
         passes: the passes that reduce the error.
         effort: the effort of the search for equalization factors.
 
     Returns:
-        The quantised network: integer core, file for the host, and the float graph it was rounded
-        from.
+        The integer core, the host's ONNX file, and the float graph that was rounded.
 
     Raises:
         ModelError: an operation that the DPU does not compute, or weights too large to quantise.
@@ -247,8 +262,19 @@ def _singles(graph: Graph, host_part: HostPart, groups: list[ResidualGroup]) -> 
 
 
 def rounded(plan: Plan, images: Sequence[np.ndarray]) -> tuple[IntCore, Graph]:
-    """Quantise a plan over calibration images (1, C, H, W): return the integer core, and the float
-    graph that was rounded.
+    """Carry out a plan on calibration images: choose scales, equalize, and round to integers.
+
+    These are steps 3 to 7 of the module.
+
+    Args:
+        plan: the float network and the passes to apply.
+        images: calibration images (1, C, H, W) float32 as the network reads them.
+
+    Returns:
+        The integer core, and the float graph after the passes, which was rounded to it.
+
+    Raises:
+        ModelError: the DPU's shifts do not reach all scales.
     """
     # 3.
     step("scale of each tensor")

@@ -54,7 +54,11 @@ BEYOND_DN = (1, 2, 4, 8, 16, 32, 64)
 
 
 class Loss:
-    """The difference between results and targets, accumulated array by array."""
+    """Sums over the differences between results and targets, from which errors are computed at the
+    end.
+
+    `mae` and `squared` are in the unit of the results that were added.
+    """
 
     def __init__(self) -> None:
         self._signal = 0.0
@@ -63,7 +67,14 @@ class Loss:
         self._count = 0
 
     def add(self, result: np.ndarray, target: np.ndarray, offset: np.ndarray | float = 0.0) -> None:
-        """Count further values; the signal is the target minus an offset."""
+        """Count the values of one more array.
+
+        Args:
+            result: the computed values.
+            target: the values that they should be, of the same shape.
+            offset: subtracted from the target to get the signal of `sqnr_db`, such as the image to
+                which a correction was added.
+        """
         difference = np.subtract(result, target, dtype=np.float64)
         self._noise += float(np.square(difference).sum())
         self._signal += float(np.square(np.subtract(target, offset, dtype=np.float64)).sum())
@@ -72,8 +83,10 @@ class Loss:
 
     @property
     def sqnr_db(self) -> float:
-        """10 log10 of the energy of the signal over that of the difference; infinite without a
-        difference.
+        """Signal-to-quantization-noise ratio in dB: 10 log10 of the signal's energy over the
+        difference's.
+
+        It is infinite if there is no difference or no signal.
         """
         return (
             10 * math.log10(self._signal / self._noise)
@@ -83,23 +96,25 @@ class Loss:
 
     @property
     def mae(self) -> float:
-        """Return the mean absolute difference."""
+        """The mean absolute difference."""
         return self._size / self._count
 
     @property
     def squared(self) -> float:
-        """Return the mean squared difference."""
+        """The mean squared difference."""
         return self._noise / self._count
 
 
 @dataclass(frozen=True)
 class LayerError:
-    """The error of one layer in int8, with all others in float.
+    """The error that one layer causes if it alone is computed in int8 and all others in float.
 
     Attributes:
         name: the name of the layer.
-        alone: in its own result; SQNR against that result.
-        network: in the restored image, of full scale; SQNR against the network's correction.
+        alone: the error of the layer's own result. Its SQNR is relative to the float result.
+        network: the error of the restored image, as a share of full scale. The layer's mean error
+            is left out, because the bias of the next layer can make up for it. The SQNR is relative
+            to the float result, less the input image if the network adds that.
     """
 
     name: str
@@ -110,12 +125,18 @@ class LayerError:
 def layer_errors(
     graph: Graph, core: IntCore, crops: Iterable[np.ndarray]
 ) -> tuple[list[LayerError], Loss]:
-    """Measure the error of each layer of a network, and of all jointly, over crops (1, C, H, W).
+    """Measure the error that each layer of a network causes in int8, and that of all layers
+    jointly.
 
     Args:
-        graph: a float graph that reads the planes, from which the core was rounded.
+        graph: the float graph that was rounded to `core`. It reads the int8 planes that an image is
+            split into.
         core: the same operations in integers.
-        crops: each passes through the network once for every layer.
+        crops: images (1, C, h, w) as the network reads them. Each is run once for every layer.
+
+    Returns:
+        The error of each layer in order, and the loss of the restored image with all layers in
+        int8.
     """
     # The same convolutions, by their side, with the values that their int8 weights and biases stand
     # for.
@@ -189,15 +210,16 @@ def _in_int8(op: Op, core: IntCore, exact: Mapping[str, np.ndarray]) -> np.ndarr
 
 
 def layer_error_rows(result: Quantized, patches: Patches) -> list[Row]:
-    """Return the error that each layer causes if it alone is in int8, as table rows.
+    """Measure the error that each layer causes if it alone is in int8, as table rows.
 
     Args:
         result: the quantised network.
-        patches: the calibration patches, of which a few are used.
+        patches: the calibration patches. A crop of each of the first few is run.
 
     Returns:
-        A row for each layer: the SQNR of its result in dB, the error of the network's result, and
-        the layer's share of the squared errors of all. The last row has the whole network in int8.
+        A row for each layer: the SQNR (signal-to-quantization-noise ratio) of its result in dB, the
+        error of the network's result, and the layer's share of the squared errors of all layers.
+        The last row has the whole network in int8.
     """
     crops = few_crops(patches.degraded, result.host)
     layers, together = layer_errors(result.graph, result.core, crops)
@@ -227,7 +249,14 @@ def _sqnr(loss: Loss, source: str) -> Figure:
 
 
 def worst_row(number: int, patches: Patches, spread: Spread) -> Row:
-    """Return the errors of a patch; for a simulated one also its content and its sensor."""
+    """Return the errors of one patch as a table row; for a simulated one also its content and its
+    sensor.
+
+    Args:
+        number: the place of the patch in `patches`, such as one of `Spread.worst`.
+        patches: the patches that the gate measured on.
+        spread: the differences of INT8 from float on these patches.
+    """
     errors = {"MAE": spread.mae[number], "max": spread.largest[number]}
     kind = "simulated patch" if patches.views else "sample"
     figures = {
@@ -254,7 +283,14 @@ def _mtf(sensor: Instrument) -> str:
 
 
 def sizes_row(spread: Spread) -> Row:
-    """Return the share of the pixels that differ by more than a few DN, and by more than many."""
+    """Return a table row with the shares of pixels, in %, whose INT8 value is off by more than some
+    numbers of DN.
+
+    BEYOND_DN lists these numbers of digital numbers (DN).
+
+    Args:
+        spread: the differences of INT8 from float.
+    """
     source = f"{len(spread.mae)} patches"
     figures = {
         f"beyond {dn} DN": measured(100 * spread.share_beyond(dn), "%", source) for dn in BEYOND_DN
@@ -269,15 +305,17 @@ MUCH_DB = 0.2
 def losses(
     result: Quantized, gate: GateResult, patches: Patches, layers: Sequence[Row] = ()
 ) -> str:
-    """Describe the loss of INT8 in a sentence, also for the worst patch.
+    """Describe the PSNR that INT8 loses in a sentence, on average and on the worst patch.
 
-    If the loss is large, the costliest layers and advice are added.
+    If the loss exceeds MUCH_DB, the costliest layers and advice are added. Without references the
+    mean difference from float is stated instead.
 
     Args:
-        result: the network.
-        gate: the differences on the patches.
-        patches: held out from calibration.
-        layers: the layers of `layer_error_rows`, if they were computed before.
+        result: the quantised network.
+        gate: the differences of INT8 from float on `patches`.
+        patches: samples that were held out from calibration.
+        layers: the rows of `layer_error_rows`, if they were computed before; otherwise they are
+            computed if the sentence needs them.
     """
     if math.isnan(gate.drop_db):
         mae = f"{gate.mae:.2g} of full scale on average"
@@ -307,7 +345,16 @@ def _costliest(layers: Sequence[Row]) -> list[tuple[str, float]]:
 
 
 def headline(gate: GateResult, layers: Sequence[Row]) -> str:
-    """Return how much INT8 loses, the kind of the errors, and the layers that make most of them."""
+    """Describe the mean error of INT8, its kind (rounding or clipping), and the layers that cause
+    most of it.
+
+    Args:
+        gate: the differences of INT8 from float.
+        layers: the rows of `layer_error_rows`.
+
+    Returns:
+        Sentences for a report.
+    """
     names = ", ".join(f"{name} {share:.0f} %" for name, share in _costliest(layers))
     drop = "" if math.isnan(gate.drop_db) else f" and costs {gate.drop_db:.2f} dB"
     return (

@@ -39,17 +39,20 @@ def open_session(
     optimise: bool = True,
     exact: bool | None = None,
 ) -> ort.InferenceSession:
-    """Open a model on the CPU such that its integers are added exactly on every processor
-    (`quant.kernels`).
+    """Open a model in onnxruntime on the CPU such that integers are added exactly on every
+    processor.
+
+    Some processors' int8 kernels saturate. There the model is rewritten first (`quant.kernels`).
 
     Args:
         model: a file or a model in memory.
-        threads: 0 uses every core.
-        optimise: False runs the graph as written.
-        exact: use the ways of a processor whose int8 kernels saturate; None tests the processor.
+        threads: the number of threads; 0 uses every core.
+        optimise: False switches onnxruntime's optimisations off, so that the graph runs as written.
+        exact: True rewrites the model as for a processor whose int8 kernels saturate, False does
+            not. None finds out whether this processor is such a one.
 
     Raises:
-        ModelError: a file that is not to be trusted, or that onnxruntime rejects.
+        ModelError: the file cannot be trusted, or onnxruntime rejects it.
     """
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
@@ -87,15 +90,27 @@ def open_session(
 
 
 def open_any_size(model: onnx.ModelProto, optimise: bool = True) -> ort.InferenceSession:
-    """Open a session for images of any size, also of a network that is fixed to one tile."""
+    """Open a session that accepts images of any size, even if the file is fixed to one tile.
+
+    Args:
+        model: a float or INT8 network.
+        optimise: False runs the graph as written.
+    """
     return open_session(any_size(model), optimise=optimise)
 
 
 def run(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:
-    """Return the restored image (N, 1, H, W) for an image of that shape, float32 in [0, 1].
+    """Restore an image by a network whose result has the shape of its input.
+
+    Args:
+        session: a session of the network, as `open_session` returns it.
+        image: (N, C, H, W) float32 as the network reads it.
+
+    Returns:
+        The restored image, (N, C, H, W) float32.
 
     Raises:
-        ModelError: a model that does not run on this image, or that returns another shape.
+        ModelError: the model does not run on this image, or returns another shape.
     """
     restored = tensors_of(session, None, image)[0]
     if restored.shape != image.shape:
@@ -104,14 +119,31 @@ def run(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:
 
 
 def result_of(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:
-    """Return the result for an image (N, C, H, W) float32 in [0, 1], whatever its size."""
+    """Run a network on an image, and return its first output, of whatever shape it is.
+
+    Args:
+        session: a session of the network, as `open_session` returns it.
+        image: (N, C, H, W) float32 as the network reads it.
+
+    Raises:
+        ModelError: the model does not run on this image.
+    """
     return tensors_of(session, None, image)[0]
 
 
 def tensors_of(
     session: ort.InferenceSession, names: list[str] | None, image: np.ndarray
 ) -> list[np.ndarray]:
-    """Return the named outputs, or all, for an image (N, 1, H, W) float32 in [0, 1]."""
+    """Run a network on an image, and return several of its outputs.
+
+    Args:
+        session: a session of the network, as `open_session` returns it.
+        names: the names of the outputs, in the order in which they are returned; None for all.
+        image: (N, C, H, W) float32 as the network reads it.
+
+    Raises:
+        ModelError: the model does not run on this image.
+    """
     try:
         values = session.run(names, {session.get_inputs()[0].name: image})
         return [np.asarray(value) for value in values]
@@ -122,10 +154,10 @@ def tensors_of(
 
 
 def require_finite(values: Iterable[np.ndarray], name: str) -> None:
-    """Raise ModelError if the results of a network for an image in [0, 1] are not finite.
+    """Raise ModelError if a network returned NaN or infinity for an image.
 
     Args:
-        values: its results.
+        values: the arrays that the network returned.
         name: the name of the network, with which the message begins.
     """
     # NaN and infinity reach the minimum or the maximum, which need no array of their own.
@@ -148,9 +180,15 @@ TILE_PX = 128
 
 
 def crops(image: np.ndarray, halo_px: int | None = 0) -> list[np.ndarray]:
-    """Return crops (1, C, h, w) of at most TILE_PX a side that tile an image (1, C, H, W).
+    """Cut an image into tiles without overlap, about equally large, of at most TILE_PX a side.
 
-    If the network has no halo (None), the image is not divided, as in `tensor_values`.
+    Args:
+        image: (1, C, H, W).
+        halo_px: the halo of the network as `halo_of` returns it; only None matters. A network
+            without a halo cannot be run on tiles, so the whole image is the only crop.
+
+    Returns:
+        Views (1, C, h, w) of the image.
     """
     return [image[..., slice(*rows), slice(*columns)] for rows, columns in _places(image, halo_px)]
 
@@ -162,12 +200,22 @@ def tensor_values(
     halo_px: int | None,
     host_part: HostPart = ONE_CHANNEL,
 ) -> Iterator[list[np.ndarray]]:
-    """Yield the named tensors (1, C, h, w) of a plane-reading float network for an image (1, C', H,
-    W), tile by tile.
+    """Compute inner tensors of a float network for an image, tile by tile, so that memory is
+    bounded.
 
     Each tile is computed with a halo of the pixels that its values depend on, which is then cut
     off. The tiles together equal the result of the whole image, zero-padded borders included.
-    Without a halo (None) the image is one tile.
+
+    Args:
+        session: a float network that reads the planes of an image (`planes_of`), not the image
+            itself.
+        names: the names of the tensors.
+        image: (1, C', H, W) in the network's units.
+        halo_px: the halo as `halo_of` returns it. With None the image is one tile.
+        host_part: the host's processing, which makes planes of the image.
+
+    Yields:
+        For each tile the tensors (1, C, h, w) in the order of `names`.
     """
     for (top, bottom), (left, right) in _places(image, halo_px):
         around_px = halo_px or 0
@@ -186,22 +234,48 @@ def tensor_values(
 def values_of(
     graph: Graph, names: list[str], images: Iterable[np.ndarray], host_part: HostPart = ONE_CHANNEL
 ) -> Iterator[list[np.ndarray]]:
-    """Yield the named tensors of a float graph that reads planes, for every tile of every image."""
+    """Compute inner tensors of a float graph for several images, tile by tile.
+
+    Args:
+        graph: a float graph that reads the planes of an image (`planes_of`).
+        names: the names of the tensors.
+        images: (1, C', H, W) in the network's units.
+        host_part: the host's processing, which makes planes of the images.
+
+    Yields:
+        For each tile of each image the tensors (1, C, h, w) in the order of `names`.
+    """
     session = open_session(graph_to_onnx(graph, names, host_part.planes))
     for image in images:
         yield from tensor_values(session, names, image, halo_of(graph), host_part)
 
 
 def planes_of(image: np.ndarray, host_part: HostPart = ONE_CHANNEL) -> np.ndarray:
-    """Return the planes (N, P, H, W) float32 of an image (N, C, H, W) in [0, 1]."""
+    """Encode an image as the float32 values of the int8 planes that a core reads.
+
+    Args:
+        image: (N, C, H, W) in the network's units.
+        host_part: the host's processing, which encodes the image.
+
+    Returns:
+        (N, P, H', W') float32, multiples of 2^-PLANES_FRAC_BITS, with P as in `HostPart.planes`.
+    """
     return host_part.encode(image).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)
 
 
 def halo_of(graph: Graph) -> int | None:
-    """Return the number of pixels on each side that a value can depend on: no path passes more than
-    all convolutions.
+    """Return the halo by which a graph can be run on tiles: the farthest pixel that a value depends
+    on.
 
-    None if values are not on the image's own lattice, or if windows do not preserve it.
+    It is the sum of the pads of all convolutions, which no path exceeds.
+
+    Args:
+        graph: a float graph.
+
+    Returns:
+        The number of pixels on each side. None if the graph cannot be run on tiles, because it has
+        other operations than adds, products, concats, activations and convolutions that preserve
+        the size.
     """
     if not all(
         isinstance(op, Add | Mul | Concat | Pointwise) or _keeps_lattice(op) for op in graph
@@ -233,8 +307,15 @@ LAYER_PATCHES = 4
 
 
 def few_crops(images: Iterable[np.ndarray], model: onnx.ModelProto) -> list[np.ndarray]:
-    """Return one crop of each of the first few images, for figures of each layer; the whole image
-    if its size is fixed.
+    """Return one crop of each of the first LAYER_PATCHES images, on which figures of each layer are
+    measured.
+
+    Args:
+        images: (1, C, H, W).
+        model: the network. If it is fixed to one size, whole images are returned.
+
+    Returns:
+        Crops (1, C, h, w).
     """
     halo_px = None if fixed_tile_px(model) is not None else 0
     return [crops(image, halo_px)[0] for image in islice(images, LAYER_PATCHES)]

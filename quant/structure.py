@@ -41,15 +41,16 @@ TABLE = 256
 
 @dataclass(frozen=True)
 class Rounded:
-    """A tensor quantised to 8 bits.
+    """A tensor that a node of an INT8 file rounds to 8 bits.
 
     Attributes:
         name: the name of the tensor.
-        scale: its scale, zero point and integer type.
+        scale: the scale, zero point and integer type of the tensor.
         low_is_relu: True if a ReLU reads the tensor, so that values clipped at the lower end would
             have become zero anyway.
-        counted: the channels that are checked for clipping. In a result of several copies these are
-            the coarse ones, which hold the values that others clip.
+        counted: the channels that are checked for clipping. If the network's result has several
+            copies, these are the channels of the coarse copy, which holds the values that the fine
+            copies clip.
     """
 
     name: str
@@ -59,7 +60,7 @@ class Rounded:
 
     @property
     def lowest(self) -> int:
-        """The smallest integer of the 8-bit type."""
+        """The smallest integer of the tensor's 8-bit type: -128 or 0."""
         return int(np.iinfo(self.scale.integer_type).min)
 
     def may_be_clipped(self, values: np.ndarray) -> np.ndarray:
@@ -83,14 +84,21 @@ class Rounded:
 
 
 def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> dict[str, float]:
-    """Return the share of each 8-bit tensor's values that lie at an end.
+    """Return for each 8-bit tensor the share of values that may have been clipped, over all images.
+
+    These are the values at the largest or smallest integer, as `Rounded.may_be_clipped` counts
+    them.
 
     Args:
         model: an INT8 network in any encoding.
         images: images as the network reads them, (N, C, H, W) float32.
 
     Returns:
-        Shares in [0, 1] by the tensor's name; empty if no node rounds to 8 bits.
+        A dict from the tensor's name to a share in [0, 1]; empty if no node rounds to 8 bits.
+
+    Raises:
+        ModelError: the nodes of the graph contradict their definition in ONNX, or the network does
+            not run on an image.
     """
     tensors = rounded_tensors(model)
     if not tensors:
@@ -114,13 +122,15 @@ def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> di
 
 
 def rounded_tensors(model: onnx.ModelProto) -> list[Rounded]:
-    """Return the tensors that the graph's nodes round to 8 bits, in the graph's order.
+    """List the tensors that the nodes of an INT8 file round to 8 bits, in the order of the nodes.
+
+    Constants, such as quantised weights, are left out.
 
     Args:
         model: a network in any encoding.
 
     Raises:
-        ModelError: a graph that contradicts itself.
+        ModelError: the nodes of the graph contradict their definition in ONNX.
     """
     with contradictions("the INT8 network"):
         return _rounded(OnnxGraph(model), _own_core(model))
@@ -172,26 +182,26 @@ def _rounded(graph: OnnxGraph, core: IntCore | None) -> list[Rounded]:
 
 @dataclass(frozen=True)
 class Relus:
-    """The number of ReLUs in a file.
+    """The number of ReLUs in a file, which shows whether a quantiser dropped one.
 
     Attributes:
-        explicit: nodes that are a ReLU: Relu, or the larger of a value and zero.
-        folded: convolutions whose 8 bits begin at zero, which is a ReLU, unless their results were
-            never below zero; and those whose saturation is their ReLU according to the description
-            in the file.
+        explicit: the number of nodes that are a ReLU: Relu, or the larger of a value and zero.
+        folded: the number of convolutions that may contain a ReLU. The integers of their results
+            begin at zero, which is a ReLU unless the results were never below zero. Convolutions
+            whose saturation is their ReLU, according to the description in the file, count as well.
     """
 
     explicit: int
     folded: int
 
     def off_by(self, expected: int) -> int:
-        """Return a lower bound of the number of ReLUs that are lost or added.
+        """Return the smallest number of ReLUs that must have been lost or added in this file.
 
-        A convolution whose 8 bits begin at zero may or may not be a ReLU. The bound assumes the
-        more favourable case.
+        A convolution whose 8 bits begin at zero (`folded`) may or may not be a ReLU. The case with
+        the smaller difference is assumed.
 
         Args:
-            expected: the expected number of ReLUs of the file.
+            expected: the number of ReLUs that the file should have.
         """
         return max(expected - self.explicit - self.folded, self.explicit - expected, 0)
 
@@ -206,13 +216,14 @@ class Relus:
 def count_relus(model: onnx.ModelProto) -> Relus:
     """Count the ReLUs of a network, so that a file that lost one can be detected.
 
-    In an INT8 file a convolution whose 8 bits begin at zero may be a ReLU; these are counted apart.
+    In an INT8 file a convolution whose 8 bits begin at zero may be a ReLU. These are counted
+    separately, in `Relus.folded`.
 
     Args:
         model: a float or an INT8 network.
 
     Raises:
-        ModelError: a graph that contradicts itself.
+        ModelError: the nodes of the graph contradict their definition in ONNX.
     """
     with contradictions("the network"):
         graph = OnnxGraph(model)
@@ -304,18 +315,20 @@ def _begins_at_zero(node: Node, tensors: dict[str, Rounded], convolved: set[str]
 def structure_checks(
     float_model: onnx.ModelProto, int8: onnx.ModelProto, must_describe: bool = False
 ) -> list[Check]:
-    """Check that the INT8 file has its ReLUs, is encoded correctly, and does not depend on
-    optimisations.
+    """Check that an INT8 file has the ReLUs of its float network, is encoded correctly, and does
+    not depend on onnxruntime's optimisations.
 
     Args:
-        float_model: the float network.
+        float_model: the float network that the INT8 file was made from.
         int8: the INT8 network.
-        must_describe: if True, a file that does not describe its integers fails. Otherwise their
-            encoding is not checked, because files of other quantisers have no description.
+        must_describe: if True, a file whose metadata do not describe its integer core fails.
+            Otherwise the encoding of such a file is not checked, because files of other quantisers
+            have no description.
 
     Returns:
-        The checks of the ReLUs, of the encoding if it is known, of float layers, and of the results
-        with and without optimisations of onnxruntime.
+        The checks, each with its value and limit: lost or added ReLUs, faults of the encoding if it
+        is described, layers that are computed in float, and the difference of the results with and
+        without optimisations of onnxruntime.
     """
     image = np.random.default_rng(0).random(_odd_size(int8), dtype=np.float32)
     # On a processor without VNNI the unoptimised graph was up to 126 DN off, because onnxruntime's

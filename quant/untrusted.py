@@ -47,8 +47,11 @@ VALUE_BYTES: dict[int, int] = {
 def check_content(model: onnx.ModelProto, where: str) -> None:
     """Raise ModelError if a model does not hold what it states.
 
+    It checks that there are an input and an output, that no stated size is absurd, and that each
+    weight has as many finite values as its size states.
+
     Args:
-        model: to be checked.
+        model: the parsed file, not checked before.
         where: name of the network for the message, such as "a.onnx" or "the float network".
     """
     graph = model.graph
@@ -66,11 +69,15 @@ def check_content(model: onnx.ModelProto, where: str) -> None:
 
 @contextmanager
 def contradictions(where: str) -> Iterator[None]:
-    """Turn the errors that a malformed graph causes, by missing inputs or impossible sizes, into
-    ModelError.
+    """Turn errors within the block that a malformed graph causes into a ModelError.
+
+    Missing inputs and impossible sizes cause such errors, at any place that reads the graph.
 
     Args:
         where: name of the network for the message, such as "a.onnx" or "the float network".
+
+    Raises:
+        ModelError: one of the exceptions in DAMAGE was raised within the block.
     """
     try:
         yield
@@ -88,11 +95,12 @@ def contradictions(where: str) -> Iterator[None]:
 
 
 def check_size(name: str, sizes: Iterable[float], where: str) -> None:
-    """Raise ModelError if a file states an absurd size of a tensor.
+    """Raise ModelError if a tensor that a file only sizes would have more than VALUES values, or
+    too many axes.
 
     Args:
         name: the name of the tensor, for the message.
-        sizes: its sizes; 0 and -1 are open sizes.
+        sizes: the sizes that the file states; 0 and -1 mean a free size.
         where: name of the network, for the message.
     """
     sizes = list(sizes)
@@ -106,14 +114,15 @@ def check_size(name: str, sizes: Iterable[float], where: str) -> None:
 
 
 def times(sizes: Iterable[float]) -> str:
-    """Format sizes for a person: 64 x 3 x 3."""
+    """Format sizes as text for a message, such as "64 x 3 x 3"."""
     return " x ".join(f"{size:.12g}" for size in sizes)
 
 
 def held_tensors(graph: onnx.GraphProto) -> Iterator[TensorProto]:
-    """Yield every constant, including those of nested graphs.
+    """Yield every constant tensor of a graph: initializers and attributes of nodes, nested graphs
+    included.
 
-    protobuf itself limits their nesting to a hundred.
+    protobuf itself limits the nesting to a hundred.
     """
     yield from graph.initializer
     for sparse in graph.sparse_initializer:

@@ -51,11 +51,11 @@ than these, because each fit runs the network on all of them.
 
 @dataclass(frozen=True)
 class Adapted:
-    """A float network of operators that a DPU computes, and the loss of the replacement.
+    """A float network whose operators a DPU computes, and the loss of replacing others by them.
 
     Attributes:
         model: the network.
-        rows: the replacement of each kind of operator, and the loss in float.
+        rows: table rows, one for each kind of replaced operator, with the PSNR lost in float.
         record: the same in words, for the metadata of a file; empty if nothing was replaced.
     """
 
@@ -66,13 +66,15 @@ class Adapted:
 
 @dataclass(frozen=True)
 class Trial:
-    """A replacement without and with compensation, each compared with the original network.
+    """A network with replaced operators, compared with the original network on held-out samples.
+
+    Convolutions may be fitted to make up for the replacement (compensation).
 
     Attributes:
         model: the compensated network, or the one without compensation if that is nearer to the
             original.
-        before: the difference without compensation.
-        after: the difference of `model`.
+        before: the differences from the original without compensation.
+        after: the differences of `model` from the original.
     """
 
     model: onnx.ModelProto
@@ -81,14 +83,18 @@ class Trial:
 
     @property
     def is_enough(self) -> bool:
-        """Return True if the loss is small enough to make an exact replacement unnecessary."""
+        """True if `model` loses at most ENOUGH_DB of PSNR, so that an exact replacement is not
+        needed.
+
+        Without references its PSNR against the original's results must be at least NEAR_DB.
+        """
         if math.isnan(self.after.drop_db):
             return self.after.psnr_between_db >= NEAR_DB
         return self.after.drop_db <= ENOUGH_DB
 
     @property
     def figures(self) -> dict[str, Figure]:
-        """The loss before and after compensation."""
+        """The loss before and after compensation in dB, by the name of the table's column."""
         source = f"{self.after.source} that no convolution was fitted on, in float"
         figures = {}
         for name, result in (("replaced", self.before), ("compensated", self.after)):
@@ -100,12 +106,18 @@ class Trial:
 
 
 def adapt(model: onnx.ModelProto, samples: Patches, held_out: Patches) -> Adapted:
-    """Replace the operators that a DPU lacks, and compensate.
+    """Replace the operators that a DPU lacks, and fit convolutions to make up for the replacement.
 
     Args:
-        model: a simplified float network.
+        model: a simplified float network; not changed.
         samples: the samples that convolutions are fitted on.
-        held_out: others, on which the loss is measured.
+        held_out: other samples, on which the loss is measured.
+
+    Returns:
+        The network and its loss; `model` without rows if the DPU lacks none of its operators.
+
+    Raises:
+        ModelError: the network has other operators that no DPU computes.
     """
     counts = {kind: len(nodes) for kind, nodes in nodes_by_kind(OnnxGraph(model)).items()}
     if not counts:

@@ -44,13 +44,14 @@ VALUES = 256
 
 @dataclass(frozen=True)
 class Networks:
-    """The original network and the adapted one, in which tensors have the same names.
+    """The original network and the one with replaced activations, in which tensors have the same
+    names.
 
     Attributes:
         original: the original network.
-        adapted: the adapted network; its weights change.
+        adapted: the network with replaced activations, whose weights are changed in place.
         graph: the graph of the adapted network.
-        images: (1, C, H, W) in [0, 1] that both are run on.
+        images: (1, C, H, W) as the networks read them, on which both are run.
     """
 
     original: onnx.ModelProto
@@ -59,19 +60,31 @@ class Networks:
     images: Sequence[np.ndarray]
 
     def is_conv(self, node: Node) -> bool:
-        """Return True for a convolution, not transposed, whose pads are stated."""
+        """Return True if a node is a convolution whose weights can be fitted.
+
+        It must have constant weights and stated pads, and must not be transposed.
+        """
         is_plain = node.attributes.get("auto_pad", "NOTSET") == "NOTSET"
         return node.op_type == "Conv" and is_plain and is_convolution(self.graph, node)
 
     def weights(self, node: Node) -> tuple[np.ndarray, np.ndarray]:
-        """Return the weights (O, I / groups, kh, kw) and the bias (O,) of a convolution."""
+        """Return the weights (O, I / groups, kh, kw) and the bias (O,) of a convolution; zeros
+        without a bias.
+        """
         weight = self.graph.constants[node.inputs[1]]
         bias = self.graph.value(node, 2)
         return weight, np.zeros(len(weight), np.float32) if bias is None else bias
 
     def set_weights(self, node: Node, weight: np.ndarray, bias: np.ndarray) -> None:
-        """Set the weights and bias of a convolution in graph and model, without changing those of
-        other nodes.
+        """Give a convolution of the adapted network weights and a bias of its own, in the graph and
+        the model.
+
+        Other nodes that read the same constants keep them.
+
+        Args:
+            node: the convolution.
+            weight: (O, I / groups, kh, kw) the new weights.
+            bias: (O,) the new bias.
         """
         numbers = {"weight": weight, "bias": bias}
         names = [self.graph.add_constant(f"{node.name}.{role}", v) for role, v in numbers.items()]
@@ -85,13 +98,17 @@ def compensated(
     changed: Collection[str],
     images: Sequence[np.ndarray],
 ) -> onnx.ModelProto:
-    """Return an adapted network whose convolutions are fitted to the original network.
+    """Fit the convolutions around replaced activations, so that the network computes nearly what
+    the original did.
 
     Args:
         original: the original network.
-        adapted: the same with other activations.
-        changed: the tensors that these write.
-        images: (1, C, H, W) in [0, 1] that both are run on.
+        adapted: the same network with replaced activations; not changed.
+        changed: the names of the tensors that the replaced activations write.
+        images: (1, C, H, W) as the networks read them, on which both are run.
+
+    Returns:
+        A copy of `adapted` with other weights and biases.
     """
     model = deepcopy(adapted)
     networks = Networks(original, model, OnnxGraph(model), images)
@@ -118,12 +135,13 @@ def compensated(
 
 @dataclass(frozen=True)
 class Target:
-    """The values that the original network computes at some places of a map.
+    """Values that the original network computes at K pixels of a map, to which a convolution is
+    fitted.
 
     Attributes:
-        rows: (K,) of the places.
-        columns: (K,) of the places.
-        values: (K, O) of the channels there.
+        rows: (K,) the row of each pixel.
+        columns: (K,) the column of each pixel.
+        values: (K, O) the values of the O channels at these pixels.
     """
 
     rows: np.ndarray
@@ -238,11 +256,17 @@ def _fit(
 
 
 class Equations:
-    """The normal equations of a convolution's weights and bias, added up image by image."""
+    """The normal equations of least squares for a convolution's weights and bias, added up image by
+    image.
+    """
 
     def __init__(self, groups: int, unknowns: int, results: int) -> None:
-        """Start equations for `results` results in each group, each with the same number of
-        weights.
+        """Start with no equations.
+
+        Args:
+            groups: the number of groups of the convolution, each of which is fitted by itself.
+            unknowns: the number of weights of one output channel: I / groups * kh * kw.
+            results: the number of output channels of a group.
         """
         self._shape = groups, unknowns, results
         self._gram = np.zeros((groups, unknowns, unknowns))
@@ -252,7 +276,12 @@ class Equations:
         self._count = 0
 
     def add(self, reads: np.ndarray, errors: np.ndarray) -> None:
-        """Add the inputs of a convolution for K results (K, I, kh, kw), and their errors (K, O)."""
+        """Add equations from K pixels of a map.
+
+        Args:
+            reads: (K, I, kh, kw) the values that the convolution reads for each pixel.
+            errors: (K, O) the changes of its results that are wanted there.
+        """
         groups, unknowns, results = self._shape
         x = reads.reshape(-1, groups, unknowns).transpose(1, 2, 0).astype(np.float64)
         y = errors.reshape(-1, groups, results).swapaxes(0, 1).astype(np.float64)
@@ -263,9 +292,14 @@ class Equations:
         self._count += len(reads)
 
     def solved(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the change of the weights (O, I / groups kh kw) and of the bias (O,).
+        """Return the changes of weights and bias that fit the equations best, with a penalty of
+        RIDGE.
 
-        Few equations change the bias alone.
+        If there are fewer than LEAST_ROWS_OF_EACH equations for each weight, only the bias is
+        changed.
+
+        Returns:
+            The changes (O, I / groups * kh * kw) of the weights and (O,) of the bias, float64.
         """
         groups, unknowns, results = self._shape
         if self._count < LEAST_ROWS_OF_EACH * unknowns:

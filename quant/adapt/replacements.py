@@ -42,7 +42,9 @@ from beers_deploy.quant.simplify.standard_operators import float_shapes
 
 
 class Kind(StrEnum):
-    """A kind of operator that a DPU lacks, by the name that tables have for it."""
+    """A kind of operator that a DPU lacks and that can be replaced. Its value is the name in
+    tables.
+    """
 
     silu = "SiLU or GELU"
     sigmoid = "Sigmoid"
@@ -69,7 +71,7 @@ EXACT = {
 
 
 def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
-    """Return the kind of operator that a node is.
+    """Return the kind of replaceable operator that a node is, if a DPU lacks it.
 
     Args:
         graph: the graph that the node belongs to.
@@ -101,9 +103,10 @@ def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
 
 
 def silu_input(graph: OnnxGraph, node: Node) -> str:
-    """Return the tensor x if a node computes a GELU of x, or x * Sigmoid(c x), c a constant or 1.
+    """Return the tensor x if a node completes an activation that HardSwish approximates.
 
-    Another c is that of the quick GELU, and the runtime writes ONNX's Swish with one.
+    That is a GELU of x, or x * Sigmoid(c x) with a constant c: 1 for SiLU, 1.702 for the quick
+    GELU.
 
     Args:
         graph: the graph that the node belongs to.
@@ -146,14 +149,25 @@ def _by_constant(graph: OnnxGraph, node: Node, source: str) -> bool:
 
 
 def slopes_of(graph: OnnxGraph, node: Node) -> np.ndarray | None:
-    """Return the slopes (C,) or (1,) of a LeakyReLU or PReLU; None for another node."""
+    """Return the slopes that a LeakyReLU or PReLU has for values below 0.
+
+    Args:
+        graph: the graph that the node belongs to.
+        node: any node.
+
+    Returns:
+        (C,), or (1,) for all channels. None for another node, or if the slopes are not one constant
+        per channel.
+    """
     if node.op_type == "LeakyRelu":
         return np.array([node.attributes.get("alpha", 0.01)], np.float32)
     return per_channel(graph.value(node, 1)) if node.op_type == "PRelu" else None
 
 
 def nodes_by_kind(graph: OnnxGraph) -> dict[Kind, list[Node]]:
-    """Return the nodes of a network that can be replaced, by their kind."""
+    """Return the nodes of a network that can be replaced, in lists by their kind, in the graph's
+    order.
+    """
     nodes: dict[Kind, list[Node]] = {}
     for node in graph.nodes:
         kind = kind_of(graph, node)
@@ -165,14 +179,17 @@ def nodes_by_kind(graph: OnnxGraph) -> dict[Kind, list[Node]]:
 def replaced(
     model: onnx.ModelProto, approximated: Collection[Kind], exact: Collection[Kind]
 ) -> onnx.ModelProto:
-    """Return a copy of a network with some kinds of nodes replaced.
+    """Return a copy of a network in which operators of some kinds are replaced by ones that a DPU
+    computes.
 
-    Tensors have the same names, except those within an exact replacement.
+    Tensors keep their names. New names occur only within an exact replacement, which has several
+    nodes.
 
     Args:
         model: a simplified float network; not changed.
-        approximated: kinds that another function replaces.
-        exact: kinds that are computed exactly by other operators. A kind in both is approximated.
+        approximated: the kinds that are replaced by another function, which is near the original.
+        exact: the kinds that are replaced by several operators with the same result. A kind in both
+            is approximated.
     """
     network = deepcopy(model)
     graph = OnnxGraph(network)

@@ -45,15 +45,17 @@ Shape = tuple[int, ...]
 
 
 class LayerWriter:
-    """Collects the C text of operations, and the definitions that it needs.
+    """Collects the C code of a core's operations: constants, and calls of the functions in
+    `kernels/`.
 
     Attributes:
-        constants: definitions of constants, each after a comment on its layer.
-        calls: statements, in order.
-        kernels: files in `kernels/`, each named by the function that is called.
+        constants: C definitions of constants, each behind a comment on its layer.
+        calls: C statements, in order.
+        kernels: the names of the C files in `kernels/` that are needed, each of which defines the
+            function of that name.
         constant_bytes: the size of all weights, biases and tables.
-        line_length: the number of values of the longest `line` in `kernels/convolve.c`.
-        weights_length: the largest number of values of `weights` there.
+        line_length: the number of values that the buffer `line` of `kernels/convolve.c` needs.
+        weights_length: the number of values that the buffer `weights` there needs.
     """
 
     def __init__(self, core: IntCore, shapes: Mapping[str, Shape]) -> None:
@@ -74,10 +76,11 @@ class LayerWriter:
         self.weights_length = 0
 
     def write(self, number: int, op: IntConv | Op) -> None:
-        """Add the constants and the call of an operation.
+        """Write an operation in C: add its constants, and the call that computes it.
 
         Args:
-            number: place of the operation in the core, from 1 on. It makes the names in C unique.
+            number: the place of the operation in the core, from 1 on. It makes the names in C
+                unique.
             op: the operation.
 
         Raises:
@@ -99,15 +102,12 @@ class LayerWriter:
         _WRITERS[type(op)](self, op, f"_{number}")
 
     def array(self, kind: type[np.int8 | np.int32], name: str, values: np.ndarray) -> str:
-        """Define a constant array.
+        """Add the definition of a constant array, and return its name.
 
         Args:
-            kind: the type of its numbers.
-            name: its name in C, which must be unique in the file.
+            kind: the type of the numbers.
+            name: the name of the array in C, which must be unique in the file.
             values: integers of any shape, stored flat in C order.
-
-        Returns:
-            The name.
         """
         self.constant_bytes += values.size * np.dtype(kind).itemsize
         numbers = fill(
@@ -137,11 +137,13 @@ class LayerWriter:
         return f"&{name}"
 
     def call(self, function: str, first: str | int, op: IntConv | Op) -> None:
-        """Add the call of a kernel's function, and mark the kernel as used.
+        """Add the call of a C function for an operation, and mark the file of the function as
+        needed.
 
         Args:
-            function: name of the function, which is also that of the kernel's file.
-            first: its first argument in C, before the maps of the inputs and of the output.
+            function: the name of the function, which is also that of its file in `kernels/`.
+            first: the C expression of the function's first argument. The maps of the inputs and of
+                the output follow.
             op: the operation.
         """
         self.kernels.add(function)
@@ -156,16 +158,17 @@ class LayerWriter:
         activation: Activation = Activation.none,
         frac_bits: int = 0,
     ) -> str:
-        """Return the C initializer of the rounding by which sums become the result of an operation.
+        """Return the C initializer of the rounding that turns the sums of an operation into its
+        result.
 
         Args:
-            op: the operation, for the message.
-            shift: right shift from the unit of the sums to that of the result. A negative one
-                shifts left.
-            bits: the bits without the sign that the largest possible sum needs.
-            activation: applied to the sums.
-            frac_bits: the fractional bits of the sums, in which the limits of the activation are
-                expressed.
+            op: the operation, whose name an error states.
+            shift: the right shift in bits from the scale of the sums to that of the result. A
+                negative one shifts left.
+            bits: the number of bits, without the sign, that no sum exceeds.
+            activation: the activation that is applied to the sums.
+            frac_bits: the number of fractional bits of the sums, in which limits of the activation
+                are expressed; only ReLU6 needs it.
 
         Returns:
             The initializer of a `struct rounding` in C.
@@ -190,12 +193,12 @@ class LayerWriter:
 
 
 def plain(name: str) -> str:
-    """Return a name from a file as text that cannot end a comment of C."""
+    """Replace what could end a C comment in a name from a file, and return the text."""
     return "".join(c if c.isascii() and (c.isalnum() or c in "._- ,:") else "_" for c in name)[:200]
 
 
 def comment(*paragraphs: str) -> str:
-    """Return paragraphs as one comment of C.
+    """Format paragraphs as one C comment.
 
     Args:
         paragraphs: texts that do not contain the end of a C comment. Each begins on a new line and

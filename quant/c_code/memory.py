@@ -12,16 +12,17 @@ IN_PLACE = (Add, Mul, Pointwise)
 
 
 def share_buffers(core: IntCore, sizes: Mapping[str, int]) -> tuple[dict[str, int], list[int]]:
-    """Assign a static buffer to each tensor.
+    """Assign a static buffer to each tensor of a core, so that the C code needs little memory.
 
     Tensors that are not needed at the same time share a buffer.
 
     Args:
-        core: the operations, in order.
+        core: the integer core.
         sizes: the sizes of the tensors in bytes, by name.
 
     Returns:
-        The number of each tensor's buffer by name, and the sizes of the buffers in bytes.
+        The number of each tensor's buffer by the tensor's name, and the size of each buffer in
+        bytes.
     """
     steps = list(enumerate(core.ops))
     last_use = {PLANES: 0} | {op.output: k for k, op in steps}

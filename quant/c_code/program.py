@@ -30,15 +30,15 @@ KERNELS = (
 
 
 def c_program(core: IntCore, tile_px: int, title: str) -> str:
-    """Return a C99 file that computes a core on one tile.
+    """Return the text of a C99 file that computes a core on one tile.
 
-    Its function `run` reads planes (P, H, W) int8 and writes the correction (C, H', W') int8, as
-    the golden vectors have them. It rounds ties up, as a DPU does.
+    Its function `run` reads planes (P, H, W) int8 and writes the result (C, H', W') int8, in the
+    layout of the golden vectors of a kit. It rounds ties up, as a DPU does.
 
     Args:
-        core: the integers.
+        core: the integer core.
         tile_px: side of the tile of the image in pixels.
-        title: where the core comes from, for the first comment.
+        title: a text on where the core comes from, for the first comment.
 
     Raises:
         ModelError: sums that are too large for int32.

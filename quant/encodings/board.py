@@ -38,16 +38,18 @@ from beers_deploy.quant.untrusted import contradictions
 def board_model(
     core: IntCore, about: dict[str, str], tile_px: int | None = None
 ) -> onnx.ModelProto:
-    """Write the core as a QDQ model from `planes` to `correction`.
+    """Write a core alone as an ONNX model with QuantizeLinear and DequantizeLinear (QDQ), which
+    board flows read.
 
-    `planes` are (N, C, H, W) float32, as q * 2^-7, and `correction` is (N, C', H', W') float32. Its
-    channels come in the copies that `HostPart.decode` combines to one value. If the host rearranges
-    pixels into channels first, the file records the number of pixels per place of the planes.
+    It reads the tensor `planes` (N, C, H, W) float32, multiples of 2^-7, and returns the tensor
+    `correction` (N, C', H', W') float32. The channels of that come in the copies that
+    `HostPart.decode` combines to one value. If the host rearranges pixels into channels first, the
+    metadata record the number of pixels per place of the planes.
 
     Args:
         core: the integer core.
-        about: metadata of the file.
-        tile_px: side of the image's tile; None for any size.
+        about: metadata of the file, by key.
+        tile_px: rows and columns of the image for which the file is fixed; None for any size.
     """
     writer = BoardWriter()
     writer.quantized("planes.dequantised", PLANES, core.frac_bits[PLANES])
@@ -89,10 +91,14 @@ def _core_file(
 
 
 def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Convert an INT8 file for onnxruntime to the board's encoding of the same integers.
+    """Return an INT8 file that was written for onnxruntime in the board's encoding of the same
+    integers.
 
-    Operators that onnxruntime needs several nodes for, such as a transposed convolution, become
-    single operators. Any other model is returned unchanged.
+    The checker reads networks this way, because operators for which onnxruntime needs several
+    nodes, such as a transposed convolution, are then single operators.
+
+    Args:
+        model: a model. One that does not describe its integers is returned unchanged.
     """
     if KEY not in metadata(model):
         return model
@@ -102,7 +108,9 @@ def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 class BoardWriter(GraphWriter):
-    """Writes tensors as the board's flow reads them: quantised to int8, then dequantised."""
+    """A graph under construction for the board's file, in which each tensor is quantised to int8,
+    then dequantised.
+    """
 
     def scale(self, tensor: str, frac_bits: int) -> list[str]:  # noqa: ARG002 - tensors of one scale share it here
         """Add the scale 2^-frac_bits and the zero point 0 of a tensor to the file.
@@ -118,7 +126,13 @@ class BoardWriter(GraphWriter):
         return [self.unit(frac_bits), self.constant("zero_point", np.array(0, np.int8))]
 
     def quantized(self, output: str, source: str, frac_bits: int) -> None:
-        """Quantise and dequantise an activation."""
+        """Write the nodes that quantise an activation to int8 and dequantise it again.
+
+        Args:
+            output: the name of the dequantised tensor.
+            source: the name of the tensor in float.
+            frac_bits: the number of fractional bits of its scale.
+        """
         middle = self.node(
             "QuantizeLinear", f"{source}.int8", [source, *self.scale(source, frac_bits)]
         )
@@ -127,13 +141,14 @@ class BoardWriter(GraphWriter):
         )
 
     def operation(self, op: IntConv | Op, feeds: list[str], output: str) -> None:
-        """Write an operation on dequantised tensors, with int8 weights and bias before a
-        DequantizeLinear.
+        """Write an operation that reads and writes dequantised tensors.
+
+        A convolution's weights and bias are stored as int8, with a DequantizeLinear behind each.
 
         Args:
             op: the operation.
-            feeds: names of its dequantised inputs.
-            output: name of its result in float.
+            feeds: the names of the dequantised tensors that it reads.
+            output: the name of its result in float, before it is quantised.
         """
         if isinstance(op, IntConv):
             weight = onnx_weight(op.weight, op.transposed)
@@ -157,20 +172,20 @@ CLAMPS = (Activation.relu, Activation.relu6)
 
 
 def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> onnx.ModelProto:
-    """Write VINT8, the file that AMD's current NPU flow compiles.
+    """Write a core as VINT8, the INT8 file that AMD's current flow for its NPU compiles.
 
-    It has the integers of the board's file in another layout, for one image of one tile, with every
+    It has the integers of the board's file in another layout, for an image of one size, with every
     size stated. Each reader of a tensor has its own pair of QuantizeLinear and DequantizeLinear,
     and each tensor its own scale and zero point.
 
-    A pair also separates an operation from its clamp, as AMD's quantiser writes it. No bit changes,
-    because a value on the grid of the result may be clamped before or after rounding. LeakyReLU is
-    not a clamp: it follows the sums directly, as the core computes it.
+    A pair also separates an operation from its clamp (ReLU or ReLU6), as AMD's quantiser writes it.
+    No bit changes, because a value on the grid of the result may be clamped before or after
+    rounding. LeakyReLU is not a clamp: it follows the sums directly, as the core computes it.
 
     Args:
         core: the integer core.
-        about: metadata of the file.
-        tile_px: side of the tile in pixels of the image.
+        about: metadata of the file, by key.
+        tile_px: rows and columns of the image for which the file is fixed.
 
     Raises:
         OptionError: `tile_px` is None.
@@ -195,7 +210,12 @@ OF_NPU = "an NPU, because its compiler accepts fixed sizes only"
 
 
 def required_tile(tile_px: int | None, use: str) -> int:
-    """Return the side of the tile, or raise OptionError if there is none: `use` needs one."""
+    """Return the side of a tile in pixels, or raise OptionError if the user gave none.
+
+    Args:
+        tile_px: the side, or None.
+        use: what needs a tile of fixed size, for the message.
+    """
     if tile_px is None:
         raise OptionError(f"`tile` must be given for {use}. Give a side in pixels, such as 640.")
     return tile_px
@@ -240,8 +260,11 @@ class _PairWriter(BoardWriter):
 
 
 def save_config(core: Path, device: str) -> Path:
-    """Write the file that AMD's compiler reads next to a core: the device, and defaults for the
-    rest.
+    """Write the configuration that AMD's compiler reads next to a VINT8 file, and return its path.
+
+    Args:
+        core: the path of the VINT8 file, in whose folder the configuration is written.
+        device: the name of the device in AMD's words. All other settings are defaults.
     """
     names = ("init", "vaiml_partition")
     vaiml = {"device": device, "optimize_level": 2}

@@ -51,7 +51,7 @@ KINDS: dict[str, type] = {
 
 
 def describe(core: IntCore) -> str:
-    """Return the core as JSON, without its arrays."""
+    """Describe a core as JSON for the metadata of its file, without weights and biases."""
     ops = [{"kind": type(op).__name__, **_plain(op)} for op in core.ops]
     return json.dumps(
         {
@@ -71,14 +71,14 @@ def _plain(op: IntConv | Op) -> dict[str, Any]:
 
 
 def described_core(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
-    """Read a core from its description and from the constants of the same file.
+    """Build the core that a file describes, with weights and biases from the file's constants.
 
     Args:
-        text: the text of `describe`.
-        constants: weights and biases by name.
+        text: the JSON that `describe` returned.
+        constants: the constants of the file, by name.
 
     Raises:
-        ModelError: metadata that are damaged, or that do not fit the constants.
+        ModelError: the description is damaged, or does not fit the constants.
     """
     try:
         description = json.loads(text)
@@ -132,14 +132,19 @@ def _op(
 
 
 def phases(weight: np.ndarray, stride: int) -> tuple[np.ndarray, int]:
-    """Rearrange the weights of a transposed convolution into those of a convolution with one output
-    per phase.
+    """Rearrange the weights of a transposed convolution into those of a convolution with stride^2
+    times as many channels.
 
     Output row q stride + f reads x[q - j] w[f + stride j]: a convolution over rows q - J + 1 .. q
-    for each f. The phases come first in the channels, as ONNX's DepthToSpace requires.
+    for each phase f, 0 <= f < stride. The phases come first in the channels, as ONNX's DepthToSpace
+    requires, which then puts them side by side.
+
+    Args:
+        weight: (O, I, kh, kw) of the transposed convolution.
+        stride: its stride in rows and columns.
 
     Returns:
-        Weights (stride^2 O, I, J, J), and their padding, J - 1.
+        The weights (stride^2 O, I, J, J), and their padding, J - 1.
     """
     outputs, inputs, *kernel = weight.shape
     reach = max(-(-k // stride) for k in kernel)
@@ -152,8 +157,13 @@ def phases(weight: np.ndarray, stride: int) -> tuple[np.ndarray, int]:
 
 
 def of_phases(weight: np.ndarray, shape: tuple[int, ...], stride: int) -> np.ndarray:
-    """Return the weights (O, I, kh, kw) from those that `phases` returned, (stride^2
-    O, I, J, J).
+    """Return the weights of a transposed convolution from those that `phases` returned: the inverse
+    of it.
+
+    Args:
+        weight: (stride^2 O, I, J, J).
+        shape: (O, I, kh, kw) of the result.
+        stride: the stride in rows and columns.
     """
     outputs, inputs, rows, columns = shape
     reach = weight.shape[2]

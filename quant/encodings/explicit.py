@@ -33,12 +33,13 @@ OPERATORS = frozenset(
 
 
 def made_explicit(model: onnx.ModelProto, texts: dict[str, str]) -> onnx.ModelProto:
-    """Return a model that computes the same, and states attributes, shapes and its producer.
+    """Return a model that computes the same and leaves nothing to defaults: attributes, shapes and
+    producer are stated.
 
     Args:
-        model: the model of ONNX's own operators. Its attributes and descriptions are changed in
+        model: a model of ONNX's own operators. Its attributes and descriptions are changed in
             place.
-        texts: descriptions of the graph, its inputs and outputs, by their names.
+        texts: the descriptions of the graph, its inputs and its outputs, by their names.
 
     Returns:
         A model with the shape of every tensor that ONNX can infer.
@@ -53,14 +54,15 @@ def made_explicit(model: onnx.ModelProto, texts: dict[str, str]) -> onnx.ModelPr
 
 
 def implicit_parts(model: onnx.ModelProto) -> dict[str, list[str]]:
-    """Return the implicit parts of a model, by the rule of the profile that forbids them.
+    """List the parts of a model that the safety-related profile of ONNX does not allow to be
+    implicit.
 
     Args:
         model: any ONNX model.
 
     Returns:
-        For each rule the names of the nodes, tensors or operators that do not comply; an empty list
-        if all of them do.
+        A dict from a description of each rule to the names of the nodes, tensors or operators that
+        do not comply; an empty list if all comply.
     """
     graph = model.graph
     opset = opset_of(model)

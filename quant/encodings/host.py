@@ -59,15 +59,15 @@ LEGAL = "int8 legal"
 
 
 def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
-    """Write the whole INT8 network for stock onnxruntime, with the input and output of its float
-    network.
+    """Write the whole INT8 network as ONNX for stock onnxruntime: from the image to the restored
+    image.
 
-    The image is (N, C, H, W) float32 in [0, 1].
+    Its input and output are those of the float network, (N, C, H, W) float32.
 
     Args:
-        core: the integer core.
-        about: metadata of the file.
-        tile_px: side of the image's tile; None for any size.
+        core: the integer core, with the host's part.
+        about: metadata of the file, by key.
+        tile_px: rows and columns of the one image that the file is fixed to; None for any size.
     """
     writer = HostWriter()
     core.host_part.write_front(writer)
@@ -84,10 +84,15 @@ def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None)
 
 
 def part_model(core: IntCore, start: int, stop: int) -> onnx.ModelProto:
-    """Return operations `start` to `stop` of a core as a model for onnxruntime.
+    """Write a part of a core as an ONNX model for onnxruntime, without the host's part.
 
-    Its inputs are the tensors in front of the part that it reads, and its outputs those that are
-    read behind it.
+    Its inputs are the tensors that the part reads from in front of it, and its outputs those of its
+    tensors that are read behind it. All are uint8 around 128.
+
+    Args:
+        core: the integer core.
+        start: the place of the part's first operation.
+        stop: the place behind the part's last operation.
     """
     writer = HostWriter()
     part = core.ops[start:stop]
@@ -109,9 +114,14 @@ def part_model(core: IntCore, start: int, stop: int) -> onnx.ModelProto:
 
 
 def live_tensors(core: IntCore, at: int) -> list[str]:
-    """Return the tensors in front of operation `at` that it or a later operation reads.
+    """Return the names of the tensors that are still needed at a place in a core.
 
-    Behind the last operation it is the result.
+    They were written in front of operation `at`, and it or a later operation reads them. Behind the
+    last operation this is the result.
+
+    Args:
+        core: the integer core.
+        at: the place of an operation, or the number of operations.
     """
     written = [PLANES, *(op.output for op in core.ops[:at])]
     reads = {CORRECTION, *chain.from_iterable(op.inputs for op in core.ops[at:])}
@@ -334,10 +344,10 @@ _WRITERS: dict[type, Callable[..., Any]] = {
 
 
 def read_core(model: onnx.ModelProto) -> IntCore:
-    """Read the core of an INT8 file that `quantize` wrote.
+    """Read the integer core of an INT8 file that `quantize` wrote for the host.
 
     Raises:
-        ModelError: a file that describes none.
+        ModelError: the file does not describe a core, or its description is damaged.
     """
     text = metadata(model).get(KEY)
     if text is not None:
@@ -349,10 +359,13 @@ def read_core(model: onnx.ModelProto) -> IntCore:
 
 
 def encoding_faults(model: onnx.ModelProto) -> list[str] | None:
-    """List where a file of `quantize` differs from what its integers define: constants, nodes, or
-    their number.
+    """List where an INT8 file differs from the integer core that its metadata describe.
 
-    Returns None for a file that neither describes its integers nor states that `quantize` wrote it.
+    The file is written again from the description, and each node and constant must be the same.
+
+    Returns:
+        A text for each fault, such as "constant conv1.weight"; empty if there is none. None for a
+        file that neither describes its integers nor states that `quantize` wrote it.
     """
     about = metadata(model)
     if KEY not in about and about.get("precision") != LEGAL:

@@ -20,15 +20,16 @@ BETWEEN = {"Conv", "LeakyRelu", "PRelu", "Relu"}
 
 
 def shrinking(graph: OnnxGraph, node: Node) -> list[Node]:
-    """Return the nodes in front of a Resize that attention has, the strided convolution first.
+    """Return the nodes of a spatial attention that reduce its map, in front of the Resize that
+    enlarges it.
 
     Args:
         graph: the graph that the node belongs to.
-        node: any node.
+        node: any node; only a Resize can be part of an attention.
 
     Returns:
-        The convolution of stride 2, the maximum of stride 3 and the nodes in front of the Resize;
-        empty if the node is something else.
+        In order: the convolution of stride 2, the maximum of stride 3, and the nodes between that
+        and the Resize. The list is empty if the node is no Resize of an attention.
     """
     nodes: list[Node] = []
     writer = _writer(graph, node.inputs[0]) if node.op_type == "Resize" else None
@@ -60,14 +61,16 @@ def _writer(graph: OnnxGraph, name: str) -> Node | None:
 
 
 def aligned(graph: OnnxGraph, node: Node) -> dict[Node, list[Node]]:
-    """Return the nodes that replace a Resize and the reducing nodes in front of it.
+    """Return the nodes that replace a spatial attention by one whose map has an integer fraction of
+    the size.
 
     Args:
         graph: the graph that the node belongs to; its constants are extended.
-        node: any node.
+        node: any node; only a Resize can end an attention.
 
     Returns:
-        The new nodes of each replaced one; empty if the node is no Resize of attention.
+        A dict from each replaced node, the Resize and those that reduce the map in front of it, to
+        the new nodes in its place. It is empty if the node ends no attention.
     """
     nodes = shrinking(graph, node)
     if not nodes:

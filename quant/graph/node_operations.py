@@ -32,12 +32,12 @@ SHRINK = "Shrink by a pool or a strided convolution, or cut the network in front
 
 
 def require(condition: bool, node: Node, rule: str, remedy: str = REMEDY) -> None:
-    """Raise ModelError unless a condition holds.
+    """Raise ModelError unless a node meets a rule of the operations that a DPU computes.
 
     Args:
-        condition: whether the node meets the rule.
+        condition: True if the node meets the rule.
         node: the node that the message names.
-        rule: a verb phrase for the message: "must ..." or "has ...".
+        rule: a verb phrase for the message on what is wrong or required: "must ..." or "has ...".
         remedy: a sentence on what to do.
     """
     if not condition:
@@ -210,7 +210,15 @@ ACTIVATIONS = {
 
 
 def read_activation(node: Node, graph: OnnxGraph) -> Activation:
-    """Return the activation that a node of `ACTIVATIONS` is."""
+    """Return the activation that a node computes.
+
+    Args:
+        node: a node whose operator is one of `ACTIVATIONS`.
+        graph: the graph that the node belongs to.
+
+    Raises:
+        ModelError: the node has a slope or limits that no DPU computes.
+    """
     activation = ACTIVATIONS[node.op_type]
     if node.op_type == "LeakyRelu":
         slope = float(node.attributes.get("alpha", 0.01))

@@ -28,7 +28,9 @@ SIXTH = 2731 / 2**14
 
 
 class Activation(StrEnum):
-    """An activation that follows an operation immediately, by ONNX's names."""
+    """An activation function that a DPU applies to the result of an operation; values are ONNX's
+    names.
+    """
 
     none = ""
     relu = "Relu"
@@ -45,8 +47,10 @@ class Activation(StrEnum):
 
     @property
     def homogeneous(self) -> bool:
-        """True if f(k x) = k f(x) for k above 0, so that factors pass. They also pass ReLU6 once
-        its six is scaled.
+        """True if f(k x) = k f(x) for each k above 0, so that factors of channels pass through.
+
+        They also pass through ReLU6 if its limit of 6 is scaled by the same factor, which
+        `Conv.ceiling` allows.
         """
         return self in (Activation.none, Activation.relu, Activation.leaky_relu)
 
@@ -68,40 +72,42 @@ _FUNCTIONS: Mapping[Activation, Callable[[np.ndarray], np.ndarray]] = {
 
 
 class Op(Protocol):
-    """The properties of every operation."""
+    """The properties that every operation of a graph has."""
 
     @property
     def name(self) -> str:
-        """Its name, which is unique."""
+        """The unique name of the operation."""
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The tensors it reads."""
+        """The names of the tensors that the operation reads."""
 
     @property
     def output(self) -> str:
-        """The tensor it writes."""
+        """The name of the tensor that the operation writes."""
 
 
 @runtime_checkable
 class HasWeight(Op, Protocol):
-    """A convolution, in float or in integers."""
+    """A convolution, either a `Conv` with float weights or an `IntConv` of the integer core."""
 
     @property
     def weight(self) -> np.ndarray:
-        """(O, I / groups, kh, kw)."""
+        """The weights, (O, I / groups, kh, kw)."""
 
     @property
     def groups(self) -> int:
-        """1, or the channels of a depthwise one."""
+        """The number of groups: 1, or the number of channels of a depthwise convolution."""
 
 
 Graph = tuple[Op, ...]
 
 
 def same(weight: np.ndarray) -> Window:
-    """Return the window of stride 1 whose padding preserves the size, for weights (O, I, kh, kw) of
-    odd sides.
+    """Return the window of stride 1 with which a convolution's result has the size of its input.
+
+    Args:
+        weight: (O, I, kh, kw) with odd kh and kw, which are all that counts.
     """
     rows = weight.shape[2] // 2
     columns = weight.shape[3] // 2
@@ -110,7 +116,13 @@ def same(weight: np.ndarray) -> Window:
 
 @dataclass(frozen=True)
 class OneInput:
-    """Operations that read one tensor, `input`."""
+    """Base class of the operations that read one tensor.
+
+    Attributes:
+        name: the unique name of the operation.
+        input: the name of the tensor that it reads.
+        output: the name of the tensor that it writes.
+    """
 
     name: str
     input: str
@@ -118,28 +130,28 @@ class OneInput:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The tensors it reads."""
+        """The name of the one tensor that the operation reads, as a tuple."""
         return (self.input,)
 
 
 @dataclass(frozen=True)
 class Conv(OneInput):
-    """A convolution with zero padding and an activation; `groups` is 1, or the number of channels
-    (depthwise).
+    """A convolution in float with zero padding, and the activation behind it.
 
     Attributes:
-        weight: (O, I / groups, kh, kw), with O the channels that it writes, also if transposed.
-        bias: (O,).
-        activation: applied to the result.
-        window: strides, pads and dilations. If transposed, it has ONNX's meaning: the
-            strides enlarge, and the pads crop.
-        groups: 1, or the number of channels.
+        weight: (O, I / groups, kh, kw) float32, with O the channels that it writes, also if
+            transposed.
+        bias: (O,) float32.
+        activation: the activation of the result.
+        window: strides, pads and dilations. If transposed, it has ONNX's meaning: the strides
+            enlarge, and the pads crop.
+        groups: 1, or the number of channels of a depthwise convolution.
         transposed: True for a transposed convolution.
-        ceiling: (O,) upper limits of a ReLU6 whose channels were scaled; None for 6.
+        ceiling: (O,) the upper limits of a ReLU6 whose channels were scaled; None for 6.
     """
 
-    weight: np.ndarray  # (O, I / groups, kh, kw) float32
-    bias: np.ndarray  # (O,) float32
+    weight: np.ndarray
+    bias: np.ndarray
     activation: Activation = Activation.none
     window: Window = field(default_factory=Window)
     groups: int = 1
@@ -149,13 +161,19 @@ class Conv(OneInput):
 
     @property
     def ceilings(self) -> np.ndarray:
-        """The values (O,) at which ReLU6 clips each channel."""
+        """The value (O,) at which ReLU6 clips each channel: `ceiling`, or 6 for all."""
         return np.full(len(self.bias), float(SIX)) if self.ceiling is None else self.ceiling
 
 
 @dataclass(frozen=True)
 class SeveralInputs:
-    """Operations that read several tensors."""
+    """Base class of the operations that read several tensors.
+
+    Attributes:
+        name: the unique name of the operation.
+        inputs: the names of the tensors that it reads.
+        output: the name of the tensor that it writes.
+    """
 
     name: str
     inputs: tuple[str, ...]
@@ -164,13 +182,19 @@ class SeveralInputs:
 
 @dataclass(frozen=True)
 class Add(SeveralInputs):
-    """An element-wise sum of two tensors."""
+    """An element-wise sum of two tensors.
+
+    Attributes:
+        activation: the activation of the sum.
+    """
 
     activation: Activation = Activation.none
 
 
 class Mul(SeveralInputs):
-    """An element-wise product of two tensors of one size."""
+    """An element-wise product of two tensors of one size; one of them may have a single pixel per
+    channel.
+    """
 
 
 class Concat(SeveralInputs):
@@ -179,7 +203,12 @@ class Concat(SeveralInputs):
 
 @dataclass(frozen=True)
 class MaxPool(OneInput):
-    """The largest value of each window; padding never counts."""
+    """The largest value of each window of a map; padding never counts.
+
+    Attributes:
+        kernel: rows and columns of a window.
+        window: strides, pads and dilations.
+    """
 
     kernel: Pair
     window: Window = field(default_factory=Window)
@@ -187,8 +216,11 @@ class MaxPool(OneInput):
 
 @dataclass(frozen=True)
 class AveragePool(OneInput):
-    """The mean of each window, with padding counted as zeros; if `kernel` is None, the mean of the
-    whole image (global pooling).
+    """The mean of each window of a map, with padding counted as zeros.
+
+    Attributes:
+        kernel: rows and columns of a window; None for the mean of the whole map (global pooling).
+        window: strides, pads and dilations.
     """
 
     kernel: Pair | None
@@ -197,8 +229,11 @@ class AveragePool(OneInput):
 
 @dataclass(frozen=True)
 class Resize(OneInput):
-    """An enlargement of rows and columns by `factor`: nearest, or bilinear with
-    half-pixel centres.
+    """An enlargement of the rows and columns of a map.
+
+    Attributes:
+        factor: the factor of rows and columns.
+        bilinear: True interpolates bilinearly with half-pixel centres, False repeats pixels.
     """
 
     factor: int
@@ -207,11 +242,13 @@ class Resize(OneInput):
 
 @dataclass(frozen=True)
 class Shuffle(OneInput):
-    """A pixel shuffle: blocks of block^2 channels become block x block pixels; or the inverse, if
-    `up` is False.
+    """A pixel shuffle: each group of block^2 channels becomes block x block pixels of one channel.
 
-    `columns_first` is torch's order of the channels (ONNX's CRD). Otherwise it is ONNX's own (DCR,
-    and SpaceToDepth).
+    Attributes:
+        block: the number of rows and of columns of a block.
+        up: False for the inverse, the pixel unshuffle.
+        columns_first: True for torch's order of the channels (ONNX's CRD). False for ONNX's default
+            (DCR), which its SpaceToDepth has too.
     """
 
     block: int
@@ -219,7 +256,7 @@ class Shuffle(OneInput):
     columns_first: bool = True
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Move values (N, C, H, W) of any type."""
+        """Apply the shuffle to values (N, C, H, W) of any type, and return the moved values."""
         count, channels, height, width = values.shape
         r = self.block
         # ONNX's DCR has the block's place before the channel, CRD (torch's order) behind it.
@@ -235,14 +272,16 @@ class Shuffle(OneInput):
 
     @property
     def inverse(self) -> "Shuffle":
-        """The shuffle that moves all values back."""
+        """The shuffle that moves all values back to where they were."""
         return replace(self, up=not self.up)
 
 
 @dataclass(frozen=True)
 class Pointwise(OneInput):
-    """A separate activation: a function of each value, which the integer core stores as a table of
-    256 values.
+    """An activation as an operation of its own, which follows no convolution or add.
+
+    Attributes:
+        activation: the function, which the integer core stores as a table of 256 values.
     """
 
     activation: Activation
@@ -260,7 +299,12 @@ def ties_scales(op: Op) -> bool:
 
 
 def united(links: Iterable[Iterable[str]]) -> dict[str, str]:
-    """Map every name to the first name that it is linked with, directly or indirectly."""
+    """Map every name to the first name of the set of names that it is linked with, directly or
+    indirectly.
+
+    Args:
+        links: groups of names; all names in a group are linked with each other.
+    """
     leader: dict[str, str] = {}
 
     def find(name: str) -> str:
@@ -275,9 +319,16 @@ def united(links: Iterable[Iterable[str]]) -> dict[str, str]:
 
 
 def tied(graph: Graph) -> dict[str, str]:
-    """Map every tensor to the first of the tensors that must share its scale.
+    """Map every tensor to the first of the tensors that must have the same scale as it.
 
-    Concat, pooling, resizing and shuffling require that.
+    Concat, pooling, resizing and shuffling require one scale of their inputs and output.
+
+    Args:
+        graph: the operations of a network.
+
+    Returns:
+        A dict from tensor name to tensor name. A tensor with a scale of its own is mapped to
+        itself.
     """
     links: list[tuple[str, ...]] = []
     # A link of one name lists each tensor, also those that share their scale with none.
@@ -288,7 +339,7 @@ def tied(graph: Graph) -> dict[str, str]:
 
 
 def tensors(graph: Graph) -> list[str]:
-    """Return the names of all results, in order."""
+    """Return the names of the tensors that the operations write, in order."""
     return [op.output for op in graph]
 
 
@@ -305,10 +356,14 @@ PLANES_FRAC_BITS = 7
 
 
 def read_planes(graph: Graph, full_scale: np.ndarray | None = None) -> Graph:
-    """Return the graph in which the convolutions on the image read the planes instead, as q * 2^-7.
+    """Let the convolutions that read an image read the int8 planes instead, which the host encodes
+    it in.
+
+    The planes are read as multiples q * 2^-7. In float the coarse plane and its remainder carry the
+    value, and the weights of the third plane are zeros: it only makes the weights finer in INT8.
 
     Args:
-        graph: a graph that reads the image.
+        graph: a float graph that reads the image, by convolutions alone.
         full_scale: (C,) the value of each channel that is encoded as 1; None for 1.
     """
     return tuple(
@@ -318,10 +373,13 @@ def read_planes(graph: Graph, full_scale: np.ndarray | None = None) -> Graph:
 
 
 def fold_full_scale(graph: Graph, full_scale: np.ndarray | None) -> Graph:
-    """Return the same graph for an image whose channels are divided by their full scale.
+    """Return the graph that computes the same from an image whose channels were divided by their
+    full scale.
+
+    The weights that read a channel are multiplied by its full scale.
 
     Args:
-        graph: the graph that reads the image, by convolutions alone.
+        graph: a float graph that reads the image, by convolutions alone.
         full_scale: (C,) the value of each channel that becomes 1; None returns `graph` itself.
     """
     if full_scale is None:

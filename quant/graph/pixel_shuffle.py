@@ -37,11 +37,14 @@ VALUES = 1 << 22
 
 
 def with_shuffles(model: onnx.ModelProto) -> OnnxGraph:
-    """Return the graph of a model in which each pixel shuffle is one node.
+    """Build the graph of a model, in which each pixel shuffle is one node.
 
-    One that the file writes as Reshape and Transpose becomes DepthToSpace or SpaceToDepth. Its
-    `mode`, also of SpaceToDepth, is the order of the channels: one of `ORDERS`, empty for any
-    other.
+    A shuffle that the file writes as Reshape and Transpose becomes DepthToSpace or SpaceToDepth.
+    The attribute `mode` of both states the order of the channels: a key of `ORDERS`, or empty for
+    any other order.
+
+    Args:
+        model: any network; not changed.
     """
     graph = OnnxGraph(model)
     chains = _chains(graph)

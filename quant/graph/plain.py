@@ -10,12 +10,20 @@ from beers_deploy.quant.graph.split_network import SplitNetwork, unsupported
 
 
 def correction_graph(model: onnx.ModelProto) -> Graph:
-    """Read a network of ConvBEERS' kind: from `image` (N, S^2, H / S, W / S) to `correction` of
-    that shape.
+    """Read a network of ConvBEERS' kind, which adds a correction to an image of one channel.
 
-    It adds a correction to an image of one channel. The correction is computed by same-size
-    convolutions of stride 1, ReLU and adds. It may run at full resolution, or at a lower one with
-    the image's pixels rearranged into channels and back.
+    The correction is computed by same-size convolutions of stride 1, ReLU and adds. It may run at
+    full resolution, or at a lower one with the image's pixels rearranged into channels and back.
+
+    Args:
+        model: a simplified float network.
+
+    Returns:
+        The operations from the tensor `image` (N, S^2, H / S, W / S) to the tensor `correction` of
+        the same shape, for blocks of S x S pixels.
+
+    Raises:
+        ModelError: a network of another kind.
     """
     network = read_network(model)
     blocks = [[shuffle.block for shuffle in end] for end in (network.front, network.back)]
@@ -44,8 +52,9 @@ def _is_plain(op: Op) -> bool:
 
 
 def image_channels(graph: Graph) -> int:
-    """Return the number of channels in which operations read the image: S^2 for blocks of S x S
-    pixels.
+    """Return the number of channels in which the operations read an image of one channel.
+
+    It is S^2 if blocks of S x S pixels were rearranged into channels.
     """
     return next(
         int(op.weight.shape[1]) for op in graph if isinstance(op, Conv) and op.input == IMAGE

@@ -30,7 +30,14 @@ FORMATS: dict[str, dict[int, tuple[int, int]]] = {
 
 @dataclass(frozen=True)
 class Scale:
-    """The number format of a quantised tensor: value = scale * (q - zero_point)."""
+    """The number format of a quantised tensor: value = scale * (q - zero_point) for the stored
+    integer q.
+
+    Attributes:
+        scales: one scale, or one for each channel.
+        zero_points: one zero point, or one for each channel.
+        integer_type: the NumPy name of the type of q, such as "int8".
+    """
 
     scales: tuple[float, ...]
     zero_points: tuple[int, ...]
@@ -44,7 +51,7 @@ class Scale:
 
     @property
     def frac_bits(self) -> int | None:
-        """The exponent p of a scale 2^-p; None for any other scale."""
+        """The number n of fractional bits of a single scale 2^-n; None for any other scale."""
         if len(self.scales) != 1:
             return None
         # `frexp` splits off a fraction in [0.5, 1), which of a power of two is exactly 0.5.
@@ -53,7 +60,15 @@ class Scale:
 
 
 def stated(node: Node, graph: OnnxGraph) -> Iterator[tuple[str, Scale]]:
-    """Yield the tensors whose format a node states, constants included, each with that format."""
+    """Yield the tensors whose number format a node states, each with that format.
+
+    A QuantizeLinear, for example, states that of its result. Constants such as weights are
+    included.
+
+    Args:
+        node: a node of the file.
+        graph: the graph that the node belongs to, which knows the constants.
+    """
     places = FORMATS.get(node.op_type, {})
     if node.op_type == "QLinearConcat":
         places = {RESULT: (0, 1)} | {i: (i + 1, i + 2) for i in range(2, len(node.inputs), 3)}
@@ -86,7 +101,11 @@ ELEMENTWISE = {"Add", "Mul", "Concat", "QLinearAdd", "QLinearMul", "QLinearConca
 
 
 class Integers:
-    """The number formats of one file."""
+    """Tells which nodes of a file compute on integers, and in which number formats.
+
+    The checker and the gate ask it about files of any quantiser, with integer kernels or QDQ. Some
+    nodes are notation only: they define how integers are read, and compute nothing.
+    """
 
     def __init__(self, graph: OnnxGraph) -> None:
         self.present = any(node.op_type in FORMATS for node in graph.nodes)
@@ -107,32 +126,50 @@ class Integers:
             self._follow(node)
 
     def resolve(self, name: str) -> str:
-        """Return the tensor that a name represents once notation is removed."""
+        """Return the tensor whose values a tensor has, once nodes that compute nothing (notation)
+        are removed.
+
+        Args:
+            name: the name of a tensor, which is returned itself if no such node writes it.
+        """
         while name in self._same:
             name = self._same[name]
         return name
 
     def constant(self, name: str) -> np.ndarray | None:
-        """Return a constant as it is stored, dequantised or not; None for a tensor that nodes
-        compute.
+        """Return a constant in the integers that the file stores, also if a node dequantises them.
+
+        Args:
+            name: the name of a tensor.
+
+        Returns:
+            The constant; None for a tensor that nodes compute.
         """
         return self._constants.get(self.resolve(name))
 
     def weight(self, node: Node) -> np.ndarray | None:
-        """Return the weights of a convolution as stored; None if there are none, or if nodes
-        compute them.
+        """Return the weights of a convolution in the integers that the file stores.
+
+        Args:
+            node: a node of the file.
+
+        Returns:
+            The weights; None if the node has none, or if other nodes compute them.
         """
         place = WEIGHTS.get(node.op_type, len(node.inputs))
         return self.constant(node.inputs[place]) if place < len(node.inputs) else None
 
     def is_integer(self, node: Node) -> bool:
-        """Return True if the file computes this node on integers."""
+        """Return True if the file computes a node on integers, by integer kernels or between Q/DQ
+        nodes.
+        """
         return node.outputs[0] in self._int8 or node.outputs[0] in self._wide
 
     def is_notation(self, node: Node) -> bool:
-        """Return True if a node, such as a DequantizeLinear, is no operation of the network.
+        """Return True if a node computes nothing, and only defines how the integers that it reads
+        are interpreted.
 
-        Such a node only defines how the integers that it reads are to be interpreted.
+        A DequantizeLinear in front of an integer operation is an example.
         """
         result = node.outputs[0]
         if node.op_type == "DequantizeLinear" and result not in self._same:
@@ -141,23 +178,32 @@ class Integers:
         return result in self._same
 
     def activations(self, node: Node) -> tuple[str, ...]:
-        """Return the tensors of the network that a node reads."""
+        """Return the names of the tensors that a node reads from other operations of the network.
+
+        Constants, scales and zero points are left out, and notation is skipped as in `resolve`.
+        """
         names = [name for name in self._operands(node) if name]
         if self.is_integer(node) and node.op_type != "QuantizeLinear":
             names = [self._dequantised.get(name, name) for name in names]
         return tuple(name for name in map(self.resolve, names) if name not in self._constants)
 
     def operand(self, node: Node) -> np.ndarray | None:
-        """Return the first constant operand of an operator, as stored."""
+        """Return the first constant among a node's operands, in the integers that the file stores;
+        None without one.
+        """
         constants = (self.constant(name) for name in self._operands(node))
         return next((value for value in constants if value is not None), None)
 
     def formats(self, node: Node) -> dict[str, tuple[Scale, ...]]:
-        """Return the formats of a node's tensors by role: "input 0", ..., "weight", "bias",
-        "constant 1", "output".
+        """Return the number formats of the tensors that a node reads and writes.
 
-        There are several if the file contradicts itself, the writer's first, and none if it states
-        none.
+        Args:
+            node: a node of the file.
+
+        Returns:
+            A dict from the tensor's role to its formats. Roles are "input 0", "input 1" and so on,
+            "weight", "bias", "constant 1" and "output". If the file contradicts itself, a tensor
+            has several formats, that of its writer first. It has none if the file states none.
         """
         stated_scales = dict(stated(node, self._graph))
         numbers = self._numbers(node)
@@ -171,8 +217,14 @@ class Integers:
         }
 
     def numbers(self, node: Node) -> dict[str, np.ndarray | None]:
-        """Return the constants of a node as stored, by role as in `formats`; None for one that
-        nodes compute.
+        """Return the constants that a node reads, in the integers that the file stores.
+
+        Args:
+            node: a node of the file.
+
+        Returns:
+            A dict from a role as in `formats` to the constant, or to None if other nodes compute
+            it.
         """
         return {role: self.constant(name) for role, name in self._numbers(node).items()}
 

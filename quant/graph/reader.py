@@ -82,7 +82,14 @@ OTHER_REMEDY = "Replace it by one that the DPU computes, or cut the network in f
 
 
 def read_network(model: onnx.ModelProto) -> SplitNetwork:
-    """Read the operations of a float network that has been simplified (`quant.simplify`)."""
+    """Read a float ONNX network as the short list of operations, split into host and DPU part.
+
+    Args:
+        model: a float network that was simplified (`quant.simplify`).
+
+    Raises:
+        ModelError: an operation that no DPU computes, or a form that is not supported.
+    """
     with contradictions("the float network"):
         reader = _Reader(model)
         network = cut(reader.graph(), reader.channels())
@@ -95,7 +102,7 @@ def read_network(model: onnx.ModelProto) -> SplitNetwork:
 
 
 def refusal(model: onnx.ModelProto) -> str:
-    """Return a sentence on why a float network cannot be quantised; "" if it can."""
+    """Return a sentence for a user on why a float network cannot be quantised; "" if it can."""
     try:
         check_runnable(model, "the float network")
         read_network(model)

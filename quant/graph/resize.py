@@ -26,10 +26,15 @@ ROUNDINGS: dict[str, Callable[[float], int]] = {
 
 @dataclass(frozen=True)
 class Resizing:
-    """A Resize, or an Upsample of older opsets, with ONNX's defaults filled in.
+    """An enlargement as a Resize node states it (or an Upsample of older opsets), with ONNX's
+    defaults filled in.
 
-    `factors` are those of N, C, H and W; they are empty if they are computed, or if a size is
-    stated.
+    Attributes:
+        factors: the factors of N, C, H and W; empty if other nodes compute them, or if a size is
+            stated instead.
+        mode: the interpolation, in ONNX's words: "nearest", "linear" or "cubic".
+        where: ONNX's `coordinate_transformation_mode`, the position of a pixel in the source.
+        rounding: ONNX's `nearest_mode`, how a position is rounded to a pixel.
     """
 
     factors: tuple[float, ...]
@@ -39,7 +44,12 @@ class Resizing:
 
     @classmethod
     def of(cls, node: Node, graph: OnnxGraph) -> "Resizing":
-        """Read the attributes and inputs of a node."""
+        """Read what a Resize or Upsample node states in its attributes and inputs.
+
+        Args:
+            node: the node.
+            graph: the graph that the node belongs to, which knows constant inputs.
+        """
         # Before opset 11 the factors are the second input, and places start at the corner.
         old = node.op_type == "Upsample" or len(node.inputs) == 2
         attribute = node.attributes.get
@@ -54,7 +64,11 @@ class Resizing:
         )
 
     def makes_blocks(self, factor: int) -> bool:
-        """Return True if each nearest pixel becomes a block of `factor` x `factor` pixels."""
+        """Return True if nearest interpolation turns each pixel into a block of `factor` x `factor`
+        pixels.
+
+        That depends on how positions are computed and rounded. The DPU repeats pixels in this way.
+        """
         if self.where not in PLACES or self.rounding not in ROUNDINGS:
             return False
         place = PLACES[self.where]

@@ -44,16 +44,21 @@ ADAPT_EXACTLY = "'quantize --adapt' (adapt=True) rewrites it exactly."
 class SplitNetwork:
     """A float network, split where the DPU's part begins and ends.
 
+    The host shuffles pixels and adds the image. The DPU computes everything else.
+
     Attributes:
-        graph: from `IMAGE` to `CORRECTION`, the part that is computed in INT8.
-        channels: the channels of the image, before `front`.
-        front: operations of the host on the image: pixel unshuffles.
-        back: operations of the host on the correction: pixel shuffles.
-        adds_image: whether the image is added to the result (the global add), in the host's float
-            numbers.
-        last: pixel shuffles of the sum. An image of one channel is added to each of the sum's.
-        border_px: by how many pixels it mirrors the image beyond its borders.
-        limits: to which it clips the result; empty if the network does not clip it.
+        graph: the operations that the DPU computes in INT8, from the tensor `IMAGE` to
+            `CORRECTION`.
+        channels: the number of channels of the image, before `front`.
+        front: pixel unshuffles of the image by the host, which come first.
+        back: pixel shuffles of the correction by the host.
+        adds_image: True if the network adds the image to the result (the global add), which the
+            host does in float.
+        last: pixel shuffles after the image was added. If the image has one channel and the sum
+            several, it is added to each of them.
+        border_px: the number of pixels by which the network mirrors the image beyond its borders.
+        limits: the low and the high end to which the network clips the result; empty if it does
+            not.
     """
 
     graph: Graph = field(compare=False)
@@ -67,27 +72,35 @@ class SplitNetwork:
 
     @property
     def core_channels(self) -> int:
-        """The number of channels that the DPU's part reads."""
+        """The number of channels that the DPU's part reads: those of the image after the unshuffles
+        of `front`.
+        """
         return self.channels * int(np.prod([shuffle.block**2 for shuffle in self.front], initial=1))
 
 
 class AdaptableError(ModelError):
-    """An operator that `quant.adapt` replaces."""
+    """A float network has an operator that the DPU lacks, but that `quant.adapt` can replace."""
 
 
 def unsupported(fault: str, remedy: str = REMEDY) -> ModelError:
-    """Return the error of a float network that cannot be quantised.
+    """Build the error for a float network that cannot be quantised.
 
     Args:
-        fault: a sentence; names in it may come from a file, and a long one is cut.
-        remedy: another sentence.
+        fault: a sentence on what is wrong. Names in it may come from a file, and a long one is cut.
+        remedy: a sentence on what to do. If it says that operators can be replaced, the error is an
+            `AdaptableError`.
     """
     kind = AdaptableError if remedy in (ADAPT, ADAPT_EXACTLY) else ModelError
     return kind(f"{printable(fault, 4 * LONGEST)} {remedy}")
 
 
 def require_one_image(inputs: Collection[str], outputs: Collection[str]) -> None:
-    """Raise ModelError unless a network has one input and one output, of these names."""
+    """Raise ModelError unless a network has exactly one input and one output.
+
+    Args:
+        inputs: the names of the network's inputs.
+        outputs: the names of the network's outputs.
+    """
     if len(inputs) != 1:
         raise unsupported(
             f"The network must have one input, the image, but it has {len(inputs)}: "
@@ -102,11 +115,17 @@ def require_one_image(inputs: Collection[str], outputs: Collection[str]) -> None
 
 
 def cut(graph: Graph, channels: int) -> SplitNetwork:
-    """Split the operations from `IMAGE` to `CORRECTION` into the host's part at both ends and the
-    rest.
+    """Split a network into the host's part at both ends, and the DPU's part between.
 
-    Pixel shuffles there only move values, which costs the host almost nothing. DPUs have been seen
-    to compute them wrongly.
+    The host gets pixel shuffles at the ends and the add of the image. Shuffles only move values,
+    which costs the host almost nothing, and DPUs have been seen to compute them wrongly.
+
+    Args:
+        graph: all operations of the network, from the tensor `IMAGE` to `CORRECTION`.
+        channels: the number of channels of the image.
+
+    Raises:
+        ModelError: nothing is left for the DPU.
     """
     graph, last = _without_shuffles(graph)
     end = graph[-1] if graph else None
@@ -167,7 +186,12 @@ def _only_reader(graph: Graph) -> Op | None:
 
 
 def renamed(op: Op, names: Mapping[str, str]) -> Op:
-    """Return an operation with its tensors renamed."""
+    """Return a copy of an operation that reads and writes tensors of other names.
+
+    Args:
+        op: the operation.
+        names: the new name of each tensor, by the old one. Other tensors keep their names.
+    """
     changed: dict[str, Any] = {"output": names.get(op.output, op.output)}
     if hasattr(op, "input"):
         changed["input"] = names.get(op.inputs[0], op.inputs[0])
@@ -177,8 +201,13 @@ def renamed(op: Op, names: Mapping[str, str]) -> Op:
 
 
 def named_apart(ops: Sequence[Op], ends: Mapping[str, str]) -> Graph:
-    """Rename tensors as `ends` states, and put "net." in front of names that this project's own
-    files use.
+    """Rename tensors and operations so that none has a name that this project's own files use.
+
+    Such names, like "planes" or "restored", get "net." in front.
+
+    Args:
+        ops: the operations of a network.
+        ends: the new name of some tensors, by the old one: those at the ends of the network.
     """
     # A network may call its own tensors "planes" or "restored", which our files use for others.
     names = {op.output: f"net.{op.output}" for op in ops if _is_ours(op.output)} | dict(ends)
@@ -196,7 +225,14 @@ def _is_ours(name: str) -> bool:
 
 
 def check_network(network: SplitNetwork) -> None:
-    """Raise ModelError if a network cannot be quantised, before anything is computed."""
+    """Raise ModelError if a network cannot be quantised, before any work is done.
+
+    Its last operation must write the result, its weights must be finite, and no pixel unshuffle of
+    several channels may be within it.
+
+    Args:
+        network: the network, split into host and DPU part.
+    """
     graph = network.graph
     if not graph or graph[-1].output != CORRECTION:
         last = f"is {graph[-1].name}" if graph else "does not exist"
@@ -219,8 +255,15 @@ def check_network(network: SplitNetwork) -> None:
 
 
 def sized(graph: Graph, size: Pair) -> Graph:
-    """Return the graph for images of one size (rows, columns), with the windows of global pooling
-    set.
+    """Return the graph for images of one size, in which global pooling has its whole map as its
+    window.
+
+    Args:
+        graph: the operations from the tensor `IMAGE` to `CORRECTION`.
+        size: rows and columns of the image.
+
+    Raises:
+        ModelError: an operation reads tensors of sizes that do not fit together.
     """
     sizes = _sizes(graph, size)
     return tuple(
@@ -258,11 +301,14 @@ WHOLE_PX = 64 * 3 * 5 * 7
 
 
 def check_result_size(graph: Graph, border_px: int) -> None:
-    """Raise ModelError unless the result has the image's size, or a multiple or a part of it.
+    """Raise ModelError unless the result's size is a fixed multiple or fraction of the image's
+    size.
+
+    Layers without padding would take some rows and columns away, whatever the size of the image.
 
     Args:
-        graph: from `IMAGE` to `CORRECTION`, for any size of image.
-        border_px: by which the image is mirrored.
+        graph: the operations from `IMAGE` to `CORRECTION`, for any size of image.
+        border_px: the number of pixels by which the network mirrors the image beyond its borders.
     """
     once, twice = (
         _sizes(graph, (side_px + 2 * border_px,) * 2)[CORRECTION]
@@ -293,11 +339,12 @@ def _size(op: Op, size: Pair) -> Pair:
 
 
 def channels_of(graph: Iterable[Op], sources: Mapping[str, int]) -> dict[str, int]:
-    """Return the number of channels of every tensor.
+    """Return the number of channels of every tensor of a graph, by its name.
 
     Args:
-        graph: operations in order.
-        sources: the number of channels of the tensors that they read but do not write.
+        graph: the operations in order.
+        sources: the number of channels, by name, of the tensors that the operations read but none
+            writes.
     """
     widths = dict(sources)
     for op in graph:

@@ -30,7 +30,15 @@ from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 
 
 def graph_to_onnx(graph: Graph, outputs: list[str], channels: int = 3) -> onnx.ModelProto:
-    """Write the graph from `planes` (N, channels, H, W) float32 to the named tensors."""
+    """Write a float graph as an ONNX model that reads the int8 planes that an image is split into.
+
+    Its input is the tensor `planes` (N, channels, H, W) float32.
+
+    Args:
+        graph: the operations.
+        outputs: the names of the tensors that the model returns.
+        channels: the number of planes; 3 is that of an image of one channel.
+    """
     writer = GraphWriter()
     for op in graph:
         feeds = list(op.inputs)
@@ -47,8 +55,14 @@ def graph_to_onnx(graph: Graph, outputs: list[str], channels: int = 3) -> onnx.M
 
 
 def onnx_weight(weight: np.ndarray, transposed: bool) -> np.ndarray:
-    """Return weights (O, I, kh, kw) in ONNX's order, which is (I, O, kh, kw) for a transposed
-    convolution.
+    """Return the weights of a convolution in the order of axes that ONNX requires.
+
+    Args:
+        weight: (O, I, kh, kw), with O the channels that are written.
+        transposed: True for a transposed convolution.
+
+    Returns:
+        (O, I, kh, kw), or (I, O, kh, kw) for a transposed convolution.
     """
     return np.ascontiguousarray(weight.swapaxes(0, 1)) if transposed else weight
 
@@ -57,10 +71,11 @@ def write_float(w: GraphWriter, op: Op, feeds: Sequence[str], output: str) -> No
     """Write an operation with ONNX's own operators.
 
     Args:
-        w: receives the nodes.
+        w: the writer that receives the nodes.
         op: the operation.
-        feeds: the names of its inputs; for a convolution with those of its weights and bias.
-        output: the name of its result.
+        feeds: the names of the tensors that the nodes read; for a convolution also those of its
+            weights and bias.
+        output: the name of the result.
     """
     # The operator of a Pointwise is its activation, so that none follows.
     activation = Activation.none
@@ -85,7 +100,13 @@ def _conv(w: GraphWriter, op: Conv, feeds: list[str], output: str) -> None:
 
 
 def window_attributes(window: Window, groups: int = 1) -> dict[str, Any]:
-    """Return the attributes that differ from ONNX's defaults, and the pads."""
+    """Return a window as ONNX attributes of a convolution or pool: the pads, and others that differ
+    from ONNX's defaults.
+
+    Args:
+        window: strides, pads and dilations.
+        groups: the number of groups of a convolution.
+    """
     attributes: dict[str, Any] = {"pads": list(window.pads)}
     if window.strides != (1, 1):
         attributes["strides"] = list(window.strides)
@@ -139,7 +160,16 @@ def _resize(w: GraphWriter, op: Resize, feeds: list[str], output: str) -> None:
 
 
 def write_shuffle(w: GraphWriter, op: Shuffle, source: str, output: str, channels: int = 1) -> None:
-    """Write a pixel shuffle, or its inverse, of a tensor of any type."""
+    """Write a pixel shuffle, or its inverse, of a tensor of any type.
+
+    Args:
+        w: the writer that receives the nodes.
+        op: the shuffle.
+        source: the name of the tensor that is read.
+        output: the name of the result.
+        channels: the number of channels that an unshuffle reads. For several, torch's order of the
+            channels needs a further node.
+    """
     if op.up:
         mode = "CRD" if op.columns_first else "DCR"
         w.node("DepthToSpace", output, [source], op.name, blocksize=op.block, mode=mode)

@@ -26,7 +26,7 @@ MOST_MARGIN_PX = 1024
 
 
 def host_part_to_json(part: HostPart) -> dict[str, Any]:
-    """Return the host's part as values that JSON has."""
+    """Describe the host's part by values that JSON has, for the metadata of an INT8 file."""
     decoding = part.decoding
     record = asdict(part)
     # Encoding and decoding are described by the flags that the first files had.
@@ -51,10 +51,13 @@ def host_part_to_json(part: HostPart) -> dict[str, Any]:
 
 
 def host_part_from_json(record: Mapping[str, Any]) -> HostPart:
-    """Return the host's part that `host_part_to_json` described.
+    """Build the host's part that `host_part_to_json` described.
+
+    Args:
+        record: the description, from a file that is not trusted.
 
     Raises:
-        LookupError, TypeError, ValueError: a damaged description.
+        LookupError, TypeError, ValueError: the description is damaged.
     """
     shuffles = {name: tuple(Shuffle(**shuffle) for shuffle in record[name]) for name in SHUFFLES}
     ranges = tuple((float(low), float(high)) for low, high in record.get("input_ranges", ()))

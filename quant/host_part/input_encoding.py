@@ -16,18 +16,20 @@ ENCODED = "host_front.planes"
 
 @dataclass(frozen=True)
 class BitSlices:
-    """Encodes a digital number (DN) of 12 bits as a coarse plane, its remainder, and a part of it.
+    """Encodes a digital number (DN) of 12 bits as several int8 planes.
 
-    DN - middle = step coarse + remainder, and the last plane is the remainder / part, rounded: with
-    it the weights of a convolution have finer steps.
+    DN - middle = step * coarse + remainder. The first planes hold the coarse number, the next one
+    the remainder, and the last one remainder / part, rounded. With the last plane the weights of a
+    convolution have finer steps.
 
     Attributes:
-        step: the DN of one coarse step.
+        step: the number of DN of one coarse step.
         part: the divisor of the remainder in the last plane.
         middle: the DN that is encoded as 0.
-        coarse_planes: how often the coarse plane comes. Two of them share the weights of a filter,
-            which then reach twice as far as int8 does.
-        margin_px: the pixels by which the image must at least be mirrored beyond its borders.
+        coarse_planes: the number of copies of the coarse plane. Two of them share the weights of a
+            filter, which can then be twice as large as int8.
+        margin_px: the number of pixels by which the image must at least be mirrored beyond its
+            borders.
         signed: if True, the image is in [-1, 1] instead of [0, 1].
     """
 
@@ -45,14 +47,12 @@ class BitSlices:
 
     @property
     def planes(self) -> int:
-        """The number of planes of each channel."""
+        """The number of int8 planes that each channel of the image becomes."""
         return self.coarse_planes + 2
 
     @property
     def limits(self) -> tuple[list[int], list[int]]:
-        """The smallest and the largest integer of each plane of a channel, determined from every
-        DN.
-        """
+        """The smallest and the largest integer of each plane of one channel, over all DN."""
         every_dn = np.arange(self.lowest_dn, MAX_DN + 1, dtype=np.float32)[None, None, None]
         planes = self.encode(every_dn / np.float32(MAX_DN))[0, :, 0]
         return planes.min(1).tolist(), planes.max(1).tolist()
@@ -76,11 +76,11 @@ class BitSlices:
         return np.concatenate(planes, axis=1).astype(np.int8)
 
     def write(self, w: HostWriter, image: str) -> None:
-        """Write the nodes that encode the tensor `image` as `ENCODED`.
+        """Write the ONNX nodes that encode an image, with the planes as the tensor ENCODED.
 
         Args:
-            w: gets the nodes.
-            image: name of a tensor (N, C, H, W) in shares of full scale.
+            w: the writer that receives the nodes.
+            image: the name of the image, a tensor (N, C, H, W) in shares of full scale.
         """
         max_dn = w.scalar("max_dn", MAX_DN)
         scaled = w.node("Mul", "host_front.scale", [image, max_dn])
@@ -104,7 +104,9 @@ class BitSlices:
         w.node("Concat", ENCODED, [*[coarse] * self.coarse_planes, remainder, part], axis=1)
 
     def constants(self) -> dict[str, int]:
-        """Return the constants that a kit's `host.py` encodes with."""
+        """Return the constants that a kit's `host.py` needs to encode an image, by their names
+        there.
+        """
         return {
             "step": self.step,
             "part": self.part,
@@ -127,23 +129,25 @@ is mirrored.
 
 @dataclass(frozen=True)
 class Direct:
-    """Stores an image that consists of planes already, in multiples of 1/128: a bank's results."""
+    """Stores values that are int8 planes already: multiples of 1/128, such as the results of a
+    sensor's filters.
+    """
 
     planes: ClassVar[int] = 1
     margin_px: ClassVar[int] = 0
     limits: ClassVar[tuple[list[int], list[int]]] = [-128], [127]
 
     def encode(self, image: np.ndarray) -> np.ndarray:
-        """Store multiples of 1/128 (N, C, H, W) as int8."""
+        """Return the integers 128 v, int8, of values v (N, C, H, W) that are multiples of 1/128."""
         # These are multiples of 1/128 already: rounding removes float error only.
         return np.clip(np.rint(image * 2.0**PLANES_FRAC_BITS), -128, 127).astype(np.int8)
 
     def write(self, w: HostWriter, image: str) -> None:
-        """Write the nodes that store the tensor `image` as `ENCODED`.
+        """Write the ONNX nodes that turn multiples of 1/128 into integers, as the tensor ENCODED.
 
         Args:
-            w: gets the nodes.
-            image: name of a tensor of multiples of 1/128.
+            w: the writer that receives the nodes.
+            image: the name of the tensor of multiples of 1/128.
         """
         scaled = w.node(
             "Mul", "host_front.scale", [image, w.scalar("units", 2.0**PLANES_FRAC_BITS)]
@@ -151,7 +155,7 @@ class Direct:
         w.node("Round", ENCODED, [scaled])
 
     def constants(self) -> None:
-        """Return None: no kit has a core without the layers in front of it."""
+        """Return None, because no kit has a core without a sensor's filters in front of it."""
         return
 
 

@@ -26,12 +26,14 @@ Constants = dict[str, object]
 
 @dataclass(frozen=True)
 class Plain:
-    """One copy, which is the value. The decodings of several copies derive from this class.
+    """Decodes a result that the core writes once. The decodings of several copies derive from this
+    class.
 
     Attributes:
-        offsets: (windows, C) numbers that the host adds to each of the last copies, in the result's
-            unit.
-        finer_bits: fractional bits that a fine copy has in addition to those of a single one.
+        offsets: (windows, C) the numbers that the host adds to each of the last copies, in the
+            result's unit; empty if it adds none.
+        finer_bits: the number of fractional bits that a fine copy has in addition to those of a
+            single copy.
     """
 
     offsets: Offsets = ()
@@ -39,40 +41,71 @@ class Plain:
 
     @property
     def gains(self) -> tuple[int, ...]:
-        """The factor by which the host multiplies each copy that the last convolution writes."""
+        """The factor by which the host multiplies each copy that the last convolution writes, in
+        order.
+        """
         return (1,)
 
     @property
     def copies(self) -> int:
-        """The number of copies of each channel that the core writes."""
+        """The number of times that the core writes each channel of the result."""
         return len(self.gains)
 
     def never_replaced(self, outputs: int) -> slice:  # noqa: ARG002 - other decodings use it
-        """Return which channels no other copy replaces, so that a clipped value there is lost."""
+        """Return the channels of the core's result that no other copy replaces where they are
+        clipped.
+
+        A clipped value there is lost, so that the check for saturation counts it.
+
+        Args:
+            outputs: the number of decoded channels.
+
+        Returns:
+            A slice of the channels.
+        """
         return slice(None)
 
     def with_bias_errors(self, errors: np.ndarray) -> "Plain":  # noqa: ARG002 - as above
-        """Return a decoding that adds errors of int8 biases (copies C,), if it adds offsets."""
+        """Return a decoding that adds the rounding errors of the last biases to its offsets, if it
+        has offsets.
+
+        Args:
+            errors: (copies C,) the float bias less the int8 bias of each channel that the core
+                writes, in the result's unit.
+        """
         return self
 
     def decode(self, result: np.ndarray, scale: float) -> np.ndarray:  # noqa: ARG002 - as above
-        """Decode a result (N, copies C, H, W) float32, multiples of `scale`, as (N, C, H, W)."""
+        """Combine the copies that the core writes of each channel to one value.
+
+        Args:
+            result: (N, copies C, H, W) float32, multiples of `scale`.
+            scale: the real value of the integer 1 of the result.
+
+        Returns:
+            The decoded values, (N, C, H, W) float32.
+        """
         return result
 
     def write(self, w: HostWriter, feeds: list[str], outputs: int, scale: float) -> None:  # noqa: ARG002 - as above
-        """Write the nodes that decode a result as `DECODED`.
+        """Write the ONNX nodes that decode a result as the tensor DECODED.
 
         Args:
-            w: gets the nodes.
-            feeds: the names of the result in uint8, of its scale and of its zero point.
+            w: the writer that receives the nodes.
+            feeds: the names of three tensors: the result in uint8, its scale and its zero point.
             outputs: the number of decoded channels.
-            scale: the value of the scale that `feeds` names, from which other decodings compute
-                their limits.
+            scale: the number in the second tensor. Decodings of several copies compute their limits
+                from it.
         """
         w.node("DequantizeLinear", DECODED, feeds)
 
     def constants(self, scale: float) -> Constants:  # noqa: ARG002 - as above
-        """Return the constants that a kit's `host.py` decodes with."""
+        """Return the constants that a kit's `host.py` needs to decode a result, by their names
+        there.
+
+        Args:
+            scale: the real value of the integer 1 of the result.
+        """
         return {"decoding": "plain"}
 
 
@@ -90,26 +123,33 @@ class DualRange(Plain):
 
     @property
     def gains(self) -> tuple[int, ...]:
-        """The factor by which the host multiplies the fine and the coarse copy."""
+        """The factors by which the host multiplies the fine and the coarse copy: 1 and GAIN."""
         return (1, GAIN)
 
     def never_replaced(self, outputs: int) -> slice:
-        """Return all channels behind the fine copy."""
+        """Return all channels behind the fine copy, which is the only one that another copy
+        replaces.
+        """
         return slice(outputs, None)
 
     def decode(self, result: np.ndarray, scale: float) -> np.ndarray:
-        """Return the fine copy where it is not clipped, else the coarse one, as (N, C, H, W).
+        """Return the fine copy where it is not clipped, else the coarse one.
 
         Args:
             result: (N, 2 C, H, W) float32, multiples of `scale`: all fine copies, then all coarse
                 ones.
-            scale: the value of one unit of the result.
+            scale: the real value of the integer 1 of the result.
+
+        Returns:
+            The decoded values, (N, C, H, W) float32.
         """
         fine, coarse = np.split(result, self.copies, axis=1)
         return _in_dual_range(fine, coarse, scale)
 
     def write(self, w: HostWriter, feeds: list[str], outputs: int, scale: float) -> None:
-        """Write the nodes that choose the fine or the coarse copy."""
+        """Write the nodes that choose the fine or the coarse copy; for the arguments see
+        `Plain.write`.
+        """
         both = w.node("DequantizeLinear", "host_back.both", feeds)
         name = "one_each" if outputs == 1 else "channels_each"
         analytic = [f"host_back.analytic_{k}" for k in range(self.copies - 2)]
@@ -122,37 +162,61 @@ class DualRange(Plain):
         w.node("Where", self._chosen, [fits, names[0], wide])
 
     def constants(self, scale: float) -> Constants:
-        """Return the limit of the fine copy, and the gain of the coarse one."""
+        """Return the constants of a kit's `host.py`: the largest valid value of the fine copy, and
+        GAIN.
+
+        Args:
+            scale: the real value of the integer 1 of the result.
+        """
         return {"decoding": "dual range", "fine_max": _fine_limit(scale), "gain": GAIN}
 
 
 @dataclass(frozen=True)
 class OffsetWindows(Plain):
-    """A coarse copy, then fine ones minus one offset each: windows side by side over the range."""
+    """A decoding of one coarse copy and several fine ones, each of which covers a part of the
+    result's range.
+
+    Such a part is called a window. The core writes a fine copy less the middle of its window, and
+    the host adds the middle again: the copy's offset.
+    """
 
     finer_bits = GAIN.bit_length() - 1
 
     @property
     def gains(self) -> tuple[int, ...]:
-        """The factor by which the host multiplies each copy."""
+        """The factors by which the host multiplies each copy: GAIN for the coarse one, which comes
+        first, then 1.
+        """
         return (GAIN, *[1] * len(self.offsets))
 
     def never_replaced(self, outputs: int) -> slice:
-        """Return the channels of the coarse copy."""
+        """Return the channels of the coarse copy, which come first."""
         return slice(outputs)
 
     def with_bias_errors(self, errors: np.ndarray) -> "OffsetWindows":
-        """Return a decoding with the errors of the fine copies in its offsets."""
+        """Return a decoding whose offsets include the rounding errors of the fine copies' biases.
+
+        Args:
+            errors: (copies C,) the float bias less the int8 bias of each channel that the core
+                writes, in the result's unit.
+        """
         # The coarse copy comes first, and the host adds no offset to it.
         fine = errors.reshape(self.copies, -1)[1:]
         return OffsetWindows(tuple(map(tuple, (np.array(self.offsets) + fine).tolist())))
 
     def decode(self, result: np.ndarray, scale: float) -> np.ndarray:
-        """Decode a result (N, copies C, H, W) as (N, C, H, W).
+        """Combine the copies of each channel to one value.
 
-        The first copy of each channel is coarse. Each other one is fine around its offset, and
-        clipped elsewhere. A value comes from the last window that does not clip it, or else from
-        the coarse copy.
+        A value comes from the last window whose copy is not clipped, plus the window's offset. If
+        all are clipped, it comes from the coarse copy.
+
+        Args:
+            result: (N, copies C, H, W) float32, multiples of `scale`: the coarse copy of all
+                channels, then the windows.
+            scale: the real value of the integer 1 of the result.
+
+        Returns:
+            The decoded values, (N, C, H, W) float32.
         """
         coarse, *windows = np.split(result, self.copies, axis=1)
         value = coarse * np.float32(GAIN)
@@ -161,7 +225,9 @@ class OffsetWindows(Plain):
         return value
 
     def write(self, w: HostWriter, feeds: list[str], outputs: int, scale: float) -> None:
-        """Write the nodes that choose the last window that holds a value."""
+        """Write the nodes that choose the last window which holds a value; for the arguments see
+        `Plain.write`.
+        """
         every = w.node("DequantizeLinear", "host_back.all", feeds)
         names = [f"host_back.window_{k}" for k in range(self.copies)]
         sizes = w.constant("channels_each", np.full(self.copies, outputs))
@@ -177,7 +243,12 @@ class OffsetWindows(Plain):
             value = w.node("Where", result, [inside, moved, value])
 
     def constants(self, scale: float) -> Constants:
-        """Return the limit of the fine copies, the gain of the coarse one, and the offsets."""
+        """Return the constants of a kit's `host.py`: the largest valid value of a fine copy, GAIN
+        and the offsets.
+
+        Args:
+            scale: the real value of the integer 1 of the result.
+        """
         return {
             "decoding": "offset windows",
             "fine_max": _fine_limit(scale),
@@ -188,10 +259,14 @@ class OffsetWindows(Plain):
 
 @dataclass(frozen=True)
 class BankSum(DualRange):
-    """The correction in dual range, plus the sum of copies of a bank's analytic restoration.
+    """A decoding for a network behind a sensor's filters: its correction plus the analytic
+    restoration.
+
+    The analytic restoration is the one that the filters compute in closed form (`model.bank`). The
+    core writes it in ANALYTIC_COPIES copies, behind a fine and a coarse copy of the correction.
 
     Attributes:
-        coarse_copies: 1 if the last analytic copy is coarse by `WIDE`, for values at which the
+        coarse_copies: 1 if the last analytic copy is coarser by `WIDE`, for values at which the
             others are clipped, else 0.
     """
 
@@ -200,12 +275,14 @@ class BankSum(DualRange):
 
     @property
     def copies(self) -> int:
-        """The number of copies of each channel that the core writes."""
+        """The number of copies of each channel that the core writes: two of the correction, then
+        the analytic ones.
+        """
         return len(self.gains) + ANALYTIC_COPIES
 
     @property
     def fine_copies(self) -> int:
-        """The number of fine analytic copies."""
+        """The number of fine copies of the analytic restoration."""
         return ANALYTIC_COPIES - self.coarse_copies
 
     def _fine_gain(self, scale: float) -> float:
@@ -218,15 +295,19 @@ class BankSum(DualRange):
         return self.coarse_copies * WIDE / (UNIT_STEPS * scale)
 
     def decode(self, result: np.ndarray, scale: float) -> np.ndarray:
-        """Return the sum of the correction and the analytic restoration, (N, C, H, W).
+        """Return the sum of the correction and the analytic restoration.
 
-        The correction is decoded in dual range. The analytic restoration is the sum of its fine
-        copies, or the coarse copy where the fine ones are clipped.
+        The correction comes from its fine copy, or from the coarse one where that is clipped. The
+        analytic restoration is the sum of its fine copies, or the coarse copy where these are
+        clipped.
 
         Args:
             result: (N, copies C, H, W) float32, multiples of `scale`: fine and coarse correction,
                 then the analytic copies.
-            scale: the value of one unit of the result.
+            scale: the real value of the integer 1 of the result.
+
+        Returns:
+            The sum, (N, C, H, W) float32.
         """
         fine, coarse, *analytic = np.split(result, self.copies, axis=1)
         fine_sum = np.sum(analytic[: self.fine_copies], 0) * np.float32(self._fine_gain(scale))
@@ -237,7 +318,9 @@ class BankSum(DualRange):
         return np.asarray(_in_dual_range(fine, coarse, scale) + fine_sum)
 
     def write(self, w: HostWriter, feeds: list[str], outputs: int, scale: float) -> None:
-        """Write the nodes that add the correction and the analytic restoration."""
+        """Write the nodes that decode correction and analytic restoration, and add both; for the
+        arguments see `Plain.write`.
+        """
         super().write(w, feeds, outputs, scale)
         analytic = [f"host_back.analytic_{k}" for k in range(ANALYTIC_COPIES)]
         fine_sum = w.node("Sum", "host_back.analytic", analytic[: self.fine_copies])
@@ -253,7 +336,12 @@ class BankSum(DualRange):
         w.node("Add", DECODED, [self._chosen, added])
 
     def constants(self, scale: float) -> Constants:
-        """Return the constants of the dual range, and those of the analytic copies."""
+        """Return the constants of a kit's `host.py`: those of `DualRange`, and the factors of the
+        analytic copies.
+
+        Args:
+            scale: the real value of the integer 1 of the result.
+        """
         return {
             **super().constants(scale),
             "decoding": "bank sum",

@@ -29,21 +29,24 @@ from beers_deploy.quant.input_range import UNIT, Ranges, largest_size
 
 @dataclass(frozen=True)
 class HostPart:
-    """The host's part of an INT8 network.
+    """The computations on the host's processor before and after the integer core of an INT8
+    network.
 
     Attributes:
-        channels: the channels of the image behind `front`.
-        outputs: channels of the decoded result.
-        front: pixel unshuffles of the image.
+        channels: the number of channels that the encoding reads: those of the image after the pixel
+            unshuffles of `front`.
+        outputs: the number of channels of the decoded result.
+        front: pixel unshuffles of the image, which come first.
         back: pixel shuffles of the decoded result.
         adds_image: if True, the image is added to the result. The sum of an image in [0, 1] is
-            clipped to that.
-        last: pixel shuffles of the sum.
-        unit: the share of full scale that is 1 in the decoded result.
-        encoding: the encoding of the image for the core.
-        decoding: the decoding of the core's result.
-        input_ranges: the input ranges of the channels of the image in front of `front`.
-        limits: to which another result is clipped; empty for none.
+            clipped to that range.
+        last: pixel shuffles after the image was added.
+        unit: the share of full scale that a decoded value of 1 stands for.
+        encoding: turns the image into the int8 planes that the core reads.
+        decoding: combines the copies of each channel that the core writes.
+        input_ranges: the range (low, high) of each channel of the image; empty if all are in [0,
+            1].
+        limits: low and high end to which a result is clipped; empty for none but the sum above.
     """
 
     channels: int = 1
@@ -62,12 +65,13 @@ class HostPart:
     def of(
         cls, network: SplitNetwork, decoding: OutputDecoding, input_ranges: Ranges = ()
     ) -> "HostPart":
-        """Build the host's part of a float network that reads the image.
+        """Build the host's part of a float network that reads the image itself.
 
         Args:
-            network: the float network, split into its core and the host's part.
-            decoding: the decoding of the core's result.
-            input_ranges: the input ranges of the image's channels; empty if all are in [0, 1].
+            network: the float network, split into host and DPU part.
+            decoding: combines the copies of each channel that the core writes.
+            input_ranges: the range (low, high) of each channel of the image; empty if all are in
+                [0, 1].
         """
         channels = network.core_channels
         return cls(
@@ -105,7 +109,7 @@ class HostPart:
 
     @property
     def planes(self) -> int:
-        """The number of int8 planes that the core reads."""
+        """The number of int8 planes that the core reads, of all channels together."""
         return self.encoding.planes * self.channels
 
     @property
@@ -116,28 +120,32 @@ class HostPart:
 
     @property
     def image_channels(self) -> int:
-        """The number of channels of the image in front of `front`."""
+        """The number of channels of the image, before the pixel unshuffles of `front`."""
         return self.channels // self.place_px**2
 
     @property
     def place_px(self) -> int:
-        """The side in pixels of the square of the image that is one place of the core's planes."""
+        """The side in pixels of the square of the image that becomes one pixel of the core's
+        planes.
+        """
         return math.prod(shuffle.block for shuffle in self.front)
 
     @property
     def correction_px(self) -> int:
-        """The side in pixels of the square of the sum that is one place of the core's result."""
+        """The side in pixels of the square that one pixel of the core's result becomes, when the
+        image is added.
+        """
         return math.prod(shuffle.block for shuffle in self.back)
 
     def encode(self, image: np.ndarray) -> np.ndarray:
-        """Encode an image as the core's planes.
+        """Encode an image as the int8 planes that the core reads.
 
         Args:
             image: (N, C, H, W) in the network's units. Sides are multiples of `place_px`.
 
         Returns:
-            Planes (N, P, H', W') int8, with P as in `planes`; H' and W' count places of `place_px`
-            pixels, those of the mirrored border included.
+            Planes (N, P, H', W') int8, with P as in `planes`. H' and W' are H and W with the
+            mirrored border, divided by `place_px`.
         """
         if self.border_px:
             image = np.pad(image, ((0, 0), (0, 0), *[(self.border_px,) * 2] * 2), "reflect")
@@ -148,42 +156,54 @@ class HostPart:
         return self.encoding.encode(image)
 
     def decode(self, result: np.ndarray, scale: float) -> np.ndarray:
-        """Decode the core's result.
+        """Combine the copies in the core's result to one value per channel.
 
         Args:
             result: (N, copies C, H, W) float32, multiples of `scale`.
-            scale: the value of one unit of the result.
+            scale: the real value of the integer 1 of the result.
 
         Returns:
-            The decoded result (N, C, H, W), in shares of full scale.
+            The decoded result (N, C, H, W), in the unit of the image: shares of full scale if that
+            is in [0, 1].
         """
         return np.asarray(self.decoding.decode(result, scale) * np.float32(self.unit))
 
     def unrounded(self, result: np.ndarray) -> np.ndarray:
-        """Decode a float result, in which no copy is rounded or clipped, so that the first one
-        suffices.
+        """Return the decoded value of a result in float, where no copy is rounded or clipped.
+
+        The first copy of each channel then has the exact value, so the others are not needed.
 
         Args:
-            result: (N, copies C, H, W) of a float network.
+            result: (N, copies C, H, W) of a float network that writes the copies.
+
+        Returns:
+            (N, C, H, W): `decode` returns it times `unit`.
         """
         return result[:, : self.outputs] * np.float32(self.decoding.gains[0])
 
     def restore(self, image: np.ndarray, result: np.ndarray, scale: float) -> np.ndarray:
-        """Return the restored image.
+        """Compute the restored image from an image and the core's result for it.
 
         Args:
             image: (N, C, H, W) in the network's units.
-            result: the core's result (N, copies C, H', W') float32, multiples of `scale`.
-            scale: the value of one unit of the result.
+            result: the core's result (N, copies C', H', W') float32, multiples of `scale`.
+            scale: the real value of the integer 1 of the result.
+
+        Returns:
+            The restored image (N, C'', H'', W'') in the network's units, clipped if the host clips.
         """
         return self.finish(image, self.decode(result, scale))
 
     def finish(self, image: np.ndarray, decoded: np.ndarray) -> np.ndarray:
-        """Return the restored image of an image and a decoded result.
+        """Compute the restored image from an image and a decoded result: shuffle, add the image,
+        and clip.
 
         Args:
             image: (N, C, H, W) in the network's units.
-            decoded: (N, C', H', W') before the pixel shuffles of `back`.
+            decoded: (N, C', H', W') as `decode` returns it, before the pixel shuffles of `back`.
+
+        Returns:
+            The restored image (N, C'', H'', W'') in the network's units.
         """
         result = decoded
         for shuffle in self.back:
@@ -194,10 +214,10 @@ class HostPart:
         return result
 
     def correction_of(self, image: np.ndarray, restored: np.ndarray) -> np.ndarray:
-        """Return the decoded result from which `finish` makes a restored image, if it does not
-        clip.
+        """Return the decoded result for which `finish` returns a given restored image, unless it
+        clips.
 
-        It is the inverse of `finish`, from its last step to its first.
+        This is the inverse of `finish`. Fine-tuning computes its targets with it.
 
         Args:
             image: (N, C, H, W) in the network's units.
@@ -212,7 +232,9 @@ class HostPart:
         return np.ascontiguousarray(result)
 
     def clip(self, result: np.ndarray) -> np.ndarray:
-        """Clip a float network's result as the host clips its own."""
+        """Clip a result to `clip_limits`, as the host does; return it unchanged if there are no
+        limits.
+        """
         if not self.clip_limits:
             return result
         low, high = self.clip_limits
@@ -220,15 +242,15 @@ class HostPart:
 
     @property
     def clip_limits(self) -> tuple[float, ...]:
-        """The limits to which the host clips the result; empty if it does not."""
+        """The low and the high end to which the host clips the result; empty if it does not."""
         adds_unit = self.adds_image and not self.input_ranges
         return self.limits or (UNIT if adds_unit else ())
 
     def write_front(self, w: HostWriter) -> None:
-        """Write the nodes in front of the core, from the image to planes in uint8.
+        """Write the ONNX nodes before the core, from the image to its planes in uint8.
 
         Args:
-            w: gets the nodes.
+            w: the writer that receives the nodes.
         """
         image = IMAGE
         channels = self.image_channels
@@ -248,12 +270,13 @@ class HostPart:
         w.node("Cast", PLANES, ["host_front.offset"], to=TensorProto.UINT8)
 
     def write_back(self, w: HostWriter, feeds: list[str], scale: float) -> None:
-        """Write the nodes behind the core, from its result to `restored`.
+        """Write the ONNX nodes after the core, from its result to the restored image, the tensor
+        `restored`.
 
         Args:
-            w: gets the nodes.
-            feeds: the names of the result in uint8, of its scale and of its zero point.
-            scale: the value of one unit of the result.
+            w: the writer that receives the nodes.
+            feeds: the names of three tensors: the result in uint8, its scale and its zero point.
+            scale: the number in the second tensor.
         """
         self.decoding.write(w, feeds, self.outputs, scale)
         result = DECODED
@@ -280,12 +303,14 @@ class HostPart:
 
 
 def image_encoding(margin_px: int, input_ranges: Ranges) -> InputEncoding:
-    """Return the encoding of a network that reads the image itself.
+    """Return the encoding for a network that reads the image itself, not the results of a sensor's
+    filters.
 
     Args:
-        margin_px: the pixels by which the image must at least be mirrored beyond its borders.
-        input_ranges: the input ranges of the image's channels. If one has values below 0, the
-            encoding is signed.
+        margin_px: the number of pixels by which the image must at least be mirrored beyond its
+            borders.
+        input_ranges: the range (low, high) of each channel of the image. If one has values below 0,
+            the encoding is signed.
     """
     signed = any(low < 0 for low, _ in input_ranges)
     return replace(IMAGE_SLICES, margin_px=margin_px, signed=signed)

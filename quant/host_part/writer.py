@@ -12,24 +12,28 @@ ZERO = 128
 
 
 class HostWriter(GraphWriter):
-    """Writes nodes that state their domain, and uint8 with the zero point 128."""
+    """A graph under construction for the host's file, in which uint8 with the zero point 128 stands
+    for int8.
+
+    Its nodes state their domain, and onnxruntime has fast kernels for uint8.
+    """
 
     domain = ""
 
     def scalar(self, name: str, value: float) -> str:
-        """Note a float32 constant, and return its name."""
+        """Store a float32 constant of one number under a name, and return its name in the file."""
         return self.constant(name, np.array(value, np.float32))
 
     def zero_point(self) -> str:
-        """Return the name of the constant 128."""
+        """Store the uint8 zero point 128 as a constant, and return its name."""
         return self.constant("zero_point", np.array(ZERO, np.uint8))
 
     def split(self, source: str, sizes: str, names: Sequence[str]) -> None:
-        """Append the node that splits the channels of `source` into tensors of these names.
+        """Append the node that splits a tensor along its channels.
 
         Args:
-            source: the tensor.
-            sizes: a constant, the number of channels of each part.
+            source: the name of the tensor.
+            sizes: the name of a constant, the number of channels of each part.
             names: the names of the parts.
         """
         node = helper.make_node("Split", [source, sizes], names, axis=1, name="host_back.split")

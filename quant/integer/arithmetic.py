@@ -22,8 +22,7 @@ LEAKY_OF_256 = 26
 def convolve(
     image: np.ndarray, weight: np.ndarray, window: Window, groups: int = 1, transposed: bool = False
 ) -> np.ndarray:
-    """Compute the sums of products of a convolution with zero padding, (N, I, H, W) to (N, O, H',
-    W') int64.
+    """Compute the sums of products of an integer convolution with zero padding, without bias.
 
     It computes a matrix product per strip of rows, in floats that represent its sums exactly. The
     windows of a whole image would need kh kw times its memory.
@@ -33,7 +32,10 @@ def convolve(
         weight: integers (O, I / groups, kh, kw).
         window: strides, pads and dilations.
         groups: 1, or the number of channels of a depthwise convolution.
-        transposed: whether strides enlarge and pads crop.
+        transposed: True for a transposed convolution, in which strides enlarge and pads crop.
+
+    Returns:
+        The sums, (N, O, H', W') int64.
     """
     if transposed:
         wide, window = _between_zeros(image, weight, window)
@@ -99,23 +101,30 @@ def _products(windows: np.ndarray, weight: np.ndarray, groups: int) -> np.ndarra
 
 
 def bound_of(op: IntConv, bias: np.ndarray) -> float:
-    """Return the bits, without the sign, of 128 times the weights' sizes plus the bias: no sum
-    exceeds these.
+    """Return the number of bits, without the sign, that no sum of a convolution exceeds, for any
+    int8 image.
+
+    It is log2 of 128 times the sum of a channel's absolute weights plus the absolute bias.
+
+    Args:
+        op: the convolution.
+        bias: (O,) its bias at the scale of the sums.
     """
     sizes = np.abs(op.weight.astype(np.int64)).sum((1, 2, 3))
     return float(np.log2(max(int((128 * sizes + np.abs(bias)).max()), 1)))
 
 
 def activated(sums: np.ndarray, activation: Activation, frac_bits: int) -> tuple[np.ndarray, int]:
-    """Apply an activation to sums.
+    """Apply an activation to the integer sums of an operation.
 
     Args:
-        sums: integers.
+        sums: integers of any shape.
         activation: the activation of the operation.
-        frac_bits: the fractional bits of the sums.
+        frac_bits: the number of fractional bits of the sums.
 
     Returns:
-        The results, and the number of fractional bits by which they are finer than the sums.
+        The results, integers, and the number of fractional bits that they have in addition to those
+        of the sums: 8 for LeakyReLU, whose slope is 26/256, else 0.
     """
     if activation is Activation.relu:
         return np.maximum(sums, 0), 0
@@ -128,15 +137,31 @@ def activated(sums: np.ndarray, activation: Activation, frac_bits: int) -> tuple
 
 
 def window_maxima(image: np.ndarray, op: MaxPool) -> np.ndarray:
-    """Return the largest value of each window (N, C, H, W), padding never."""
+    """Return the largest value of each window of a max pool; padding never counts.
+
+    Args:
+        image: integers (N, C, H, W).
+        op: the max pool.
+
+    Returns:
+        (N, C, H', W') in the type of the image.
+    """
     # No value is below the smallest of the type, so the padding never is a window's maximum.
     wide = _padded(image, op.window, int(np.iinfo(image.dtype).min))
     return np.asarray(_windows(wide, op.kernel, op.window).max((4, 5)))
 
 
 def means(image: np.ndarray, op: AveragePool) -> tuple[np.ndarray, int, float]:
-    """Return each window's sum times the DPU's factor, the shift behind it, and the bits that it
-    cannot exceed.
+    """Compute the mean of each window of an average pool as the DPU does: a sum times an integer,
+    then a shift.
+
+    Args:
+        image: int8 values (N, C, H, W).
+        op: the average pool, with the size of its window.
+
+    Returns:
+        The sums times the factor of `mean_factor`, (N, C, H', W') int64; the right shift that makes
+        means of them; and the number of bits, without the sign, that they cannot exceed.
     """
     assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
     factor, shift = mean_factor(op.kernel)
@@ -147,8 +172,15 @@ def means(image: np.ndarray, op: AveragePool) -> tuple[np.ndarray, int, float]:
 
 
 def enlarged(image: np.ndarray, factor: int) -> tuple[np.ndarray, int, float]:
-    """Enlarge by bilinear weights with half-pixel centres, edges repeated: sums, the shift behind
-    them, their bits.
+    """Enlarge a map by integer bilinear weights, with half-pixel centres and edges repeated.
+
+    Args:
+        image: int8 values (N, C, H, W).
+        factor: the factor of rows and columns, 2 or 4.
+
+    Returns:
+        The weighted sums, (N, C, factor H, factor W) int64; the right shift that makes values of
+        them; and the number of bits, without the sign, that they cannot exceed.
     """
     weight, shift = bilinear_weights(factor)
     wide = np.pad(image, ((0, 0), (0, 0), (1, 1), (1, 1)), mode="edge").astype(np.int64)
@@ -174,8 +206,13 @@ MEANS = {
 
 
 def mean_factor(kernel: tuple[int, int]) -> tuple[int, int]:
-    """Return (m, s), with m in int8, such that the DPU computes a window's mean as its sum times m
-    / 2^s.
+    """Return the integer factor and the shift by which the DPU computes the mean of a window.
+
+    Args:
+        kernel: rows and columns of the window.
+
+    Returns:
+        (m, s), with m in int8: the mean is the window's sum times m / 2^s, approximately.
     """
     if kernel in MEANS:
         return MEANS[kernel]
@@ -189,8 +226,15 @@ def mean_factor(kernel: tuple[int, int]) -> tuple[int, int]:
 
 
 def bilinear_weights(factor: int) -> tuple[np.ndarray, int]:
-    """Return integer weights (factor^2, 3, 3) of each phase of an enlargement by 2 or 4, and the
-    shift behind them.
+    """Return the integer weights of a bilinear enlargement, and the shift that divides by their
+    sum.
+
+    Args:
+        factor: the factor of rows and columns, 2 or 4.
+
+    Returns:
+        Weights (factor^2, 3, 3) and a shift s. Each pixel becomes factor^2 pixels, and each of
+        those has weights for the 3 x 3 neighbours of the pixel, which add up to 2^s.
     """
     places = (np.arange(factor) + 0.5) / factor - 0.5  # half-pixel centres, in input pixels
     shares = np.stack([np.maximum(-places, 0), 1 - np.abs(places), np.maximum(places, 0)], 1)
@@ -201,7 +245,7 @@ def bilinear_weights(factor: int) -> tuple[np.ndarray, int]:
 
 
 def six_in_units(frac_bits: int) -> int:
-    """Return 6 in integer multiples of 2^-n, or the end of int8 if that is smaller."""
+    """Return the integer at which a ReLU6 clips: 6 in units of 2^-frac_bits, at most 127."""
     return min(int(np.floor(6 * 2.0**frac_bits + 0.5)), INT8_MAX)
 
 
@@ -210,7 +254,8 @@ def activation_table(op: Pointwise, frac_bits: Mapping[str, int]) -> np.ndarray:
 
     Args:
         op: the activation.
-        frac_bits: the fractional bits of its input and of its output, by the name of the tensor.
+        frac_bits: the number of fractional bits of each tensor by its name, at least of the two
+            that the activation reads and writes.
 
     Returns:
         (256,) int16, clipped to int8.

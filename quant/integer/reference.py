@@ -58,20 +58,27 @@ BITS_SOURCE = "128 times the sum of the weights' sizes, plus the bias: no input 
 
 @dataclass(frozen=True)
 class Faults:
-    """Faults that are injected while the core runs, and guards against them.
+    """Faults that are injected while a core runs, to measure their effect.
 
     Attributes:
-        shifts: wrong shifts, by operation and field: `shift_cut`, `shift_bias` of a convolution,
-            `shift_write` of an add.
-        touch: function by tensor name that changes a tensor between the operation that writes it
-            and those that read it.
+        shifts: wrong shifts in bits, by the names of operation and shift. Shifts are `shift_cut`
+            and `shift_bias` of a convolution, and `shift_write` of an add.
+        touch: a function that is called with the name and the values of each tensor after it is
+            written, and that returns the values which later operations read.
     """
 
     shifts: Mapping[tuple[str, str], int] = field(default_factory=dict)
     touch: Callable[[str, np.ndarray], np.ndarray] = field(default=lambda _, tensor: tensor)
 
     def shift(self, op: str, name: str, meant: int) -> int:
-        """Return the shift that an operation uses: the injected one, or `meant` without a fault."""
+        """Return the shift in bits that an operation uses: the injected one, or `meant` if there is
+        no fault.
+
+        Args:
+            op: the name of the operation.
+            name: the name of the shift, such as "shift_cut".
+            meant: the right shift.
+        """
         return self.shifts.get((op, name), meant)
 
 
@@ -84,11 +91,12 @@ class LayerReport:
 
     Attributes:
         name: the name of the operation.
-        peak_bits: bits that the largest accumulator needed, without the sign.
-        proven_bits: bits that no input can exceed: 128 times the sum of the weights' absolute
-            values, plus the bias.
-        saturated: share of the results at the ends of int8.
-        ties: share of the results that were decided by tie rounding.
+        peak_bits: the number of bits, without the sign, that the largest accumulator needed.
+        proven_bits: the number of bits that no accumulator can exceed, for any input. For a
+            convolution: 128 times the sum of a channel's absolute weights, plus the bias.
+        saturated: the share of the results at the ends of int8, in [0, 1].
+        ties: the share of the results whose shifted sum ended in exactly one half, so that the rule
+            for ties decided.
     """
 
     name: str
@@ -101,16 +109,18 @@ class LayerReport:
 def run_core(
     core: IntCore, planes: np.ndarray, half_even: bool = False, faults: Faults = SOUND
 ) -> tuple[dict[str, np.ndarray], list[LayerReport]]:
-    """Run a core on int8 planes (N, P, H, W).
+    """Run an integer core on the int8 planes of an image, operation by operation, as the DPU
+    computes.
 
     Args:
         core: the integer core.
-        planes: its input.
-        half_even: whether ties are rounded to even, as onnxruntime does, instead of up.
-        faults: the faults that are injected.
+        planes: (N, P, H, W) int8, as `HostPart.encode` returns them.
+        half_even: True rounds ties to even, as onnxruntime does; False rounds them up, as the DPU
+            does.
+        faults: the faults that are injected; SOUND has none.
 
     Returns:
-        Every tensor by name, as int16, and one report per operation.
+        Every tensor (N, C, H, W) int16 by name, and one report per operation.
     """
     tensors = {PLANES: faults.touch(PLANES, planes.astype(np.int16))}
     reports = []
@@ -128,16 +138,32 @@ def run_core(
 
 
 def correction(core: IntCore, planes: np.ndarray, half_even: bool = False) -> np.ndarray:
-    """Return the correction (N, C, H, W) for int8 planes (N, P, H, W), with all its copies.
+    """Run an integer core, and return its result in real values, with all copies of each channel.
 
-    It is float32, in multiples of its scale. `half_even` rounds ties to even, as onnxruntime does.
+    Args:
+        core: the integer core.
+        planes: (N, P, H, W) int8, as `HostPart.encode` returns them.
+        half_even: True rounds ties to even, as onnxruntime does; False rounds them up, as the DPU
+            does.
+
+    Returns:
+        (N, copies C, H, W) float32, multiples of the result's scale.
     """
     tensors, _ = run_core(core, planes, half_even)
     return np.asarray(tensors[CORRECTION] * np.float32(core.scale(CORRECTION)), np.float32)
 
 
 def merged_correction(core: IntCore, tensors: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the correction (N, C, H, W) of full scale as the host reads it from the tensors."""
+    """Decode the result in a core's tensors as the host does, with one value for the copies of each
+    channel.
+
+    Args:
+        core: the integer core.
+        tensors: the integers of each tensor by name, as `run_core` returns them.
+
+    Returns:
+        (N, C, H, W) float32, as `HostPart.decode` returns it.
+    """
     scale = core.scale(CORRECTION)
     return core.host_part.decode(
         (tensors[CORRECTION] * np.float32(scale)).astype(np.float32), scale
@@ -161,12 +187,13 @@ def layer_sums(
     Args:
         core: the integer core that the operation belongs to.
         op: the operation.
-        tensors: int8 tensors by name, with the inputs of the operation.
+        tensors: int8 values by tensor name, with those that the operation reads.
         faults: shifts that are replaced by wrong ones, to simulate faults.
 
     Returns:
-        The sums, the right shift to int8, a bound of the accumulators in bits, and the fractional
-        bits that an activation added.
+        The sums (N, C, H, W); the right shift that leads to int8; the number of bits, without the
+        sign, that the accumulators cannot exceed; and the number of fractional bits that an
+        activation added to the sums.
     """
     inputs = [tensors[name] for name in op.inputs]
     if isinstance(op, IntConv):
@@ -233,15 +260,15 @@ def _add(core: IntCore, op: Add, inputs: list[np.ndarray], faults: Faults) -> Su
 
 
 def rounded(sums: np.ndarray, shift: int, half_even: bool) -> tuple[np.ndarray, float]:
-    """Divide sums by 2^shift and round them, without clipping.
+    """Divide integers by 2^shift and round them, without clipping.
 
     Args:
-        sums: integers.
-        shift: right shift; a negative one shifts left.
-        half_even: whether ties are rounded to even instead of up.
+        sums: integers of any shape.
+        shift: the right shift in bits; a negative one shifts left.
+        half_even: True rounds ties to even, False up.
 
     Returns:
-        The integers, and the share of ties.
+        The integers, and the share of the sums that were ties (exactly one half).
     """
     if shift <= 0:
         return sums << min(-shift, 8), 0.0  # by 8 all but 0 lies beyond int8
@@ -262,14 +289,16 @@ def saturated(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class LayerAgreement:
-    """One operation's results, computed three times.
+    """A comparison of one operation's results: the DPU's rule for ties, ties to even, and
+    onnxruntime.
 
     Attributes:
         report: the report of the integer reference, which rounds ties up, as the DPU does.
-        unequal: share of onnxruntime's results that are not the reference's when that rounds ties
-            to even.
-        moved: share of the results that the DPU's rule changes, here or in a layer before.
-        moved_by: the largest of these changes, in units of 2^-n.
+        unequal: the share of onnxruntime's results that differ from the reference when that rounds
+            ties to even. It should be 0.
+        moved: the share of the results that differ between both rules, because of this operation or
+            of those before it.
+        moved_by: the largest of these differences, as a number of steps of the tensor's scale.
     """
 
     report: LayerReport
@@ -280,8 +309,12 @@ class LayerAgreement:
 
 @dataclass(frozen=True)
 class Agreement:
-    """All operations in order, and the correction (N, C, H, W) of full scale with half up, and to
-    even.
+    """A comparison of a core's results by both rules for ties, and with onnxruntime.
+
+    Attributes:
+        layers: the comparison for each operation, in order.
+        up: the decoded result (N, C, H, W) with ties rounded up, as on the DPU.
+        even: the decoded result with ties rounded to even, as in onnxruntime.
     """
 
     layers: list[LayerAgreement]
@@ -290,12 +323,13 @@ class Agreement:
 
 
 def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreement:
-    """Run the core by both rules and in onnxruntime.
+    """Run a core by both rules for ties and in onnxruntime, and compare the results of each
+    operation.
 
     Args:
-        core: the integers.
-        host: the same in the host's encoding.
-        image: (N, C, H, W) in [0, 1].
+        core: the integer core.
+        host: the host's ONNX file of this core.
+        image: (N, C, H, W) float32 as the network reads it.
     """
     names = [op.output for op in core.ops]
     session = open_session(
@@ -317,9 +351,16 @@ def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreem
 def integer_rows(
     model: onnx.ModelProto, core: IntCore, host: onnx.ModelProto, images: Iterable[np.ndarray]
 ) -> tuple[Row, ...]:
-    """Return a row for each integer operation on a crop of a few images (1, C, H, W).
+    """Compare a core with the integer reference on a few crops, as table rows.
 
-    The last row is for the effect of the DPU's tie rounding.
+    Args:
+        model: the float network.
+        core: the integer core.
+        host: the host's ONNX file of this core.
+        images: calibration images (1, C, H, W), a crop of the first few of which is run.
+
+    Returns:
+        A row for each integer operation, then one for the effect of the DPU's tie rounding.
     """
     patches = few_crops(images, model)
     agreements = [agreement(core, host, crop) for crop in patches]

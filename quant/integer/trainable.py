@@ -55,12 +55,17 @@ NEAR = 0.49
 
 
 def to_int8(values: Tensor, low: int = INT8_MIN, high: int = INT8_MAX) -> Tensor:
-    """Round, ties to even, and clip; the slope is 1, and 0 where it is clipped.
+    """Round values to integers and clip them, such that gradients pass.
+
+    Ties go to even. Backwards the slope is 1, and 0 where values are clipped.
 
     Args:
-        values: float32 in units of the result.
+        values: float32 in units of the result's scale.
         low: the smallest integer of the result.
         high: the largest integer of the result.
+
+    Returns:
+        Integers as float32.
     """
     # hardtanh has slope 0 outside its limits, so a value must pass as long as it rounds to an end.
     clipped = functional.hardtanh(values, low - NEAR, high + NEAR)
@@ -72,8 +77,8 @@ def to_int8(values: Tensor, low: int = INT8_MIN, high: int = INT8_MAX) -> Tensor
 class TrainableCore(torch.nn.Module):
     """An integer core in torch, whose weights and biases are trained while all scales are fixed.
 
-    The parameters are in units of their own scale. They may lie between integers, but the forward
-    pass uses the nearest ones.
+    The parameters are floats in units of their own scale. They may lie between integers, but the
+    forward pass uses the nearest ones.
     """
 
     def __init__(self, core: IntCore) -> None:
@@ -90,7 +95,7 @@ class TrainableCore(torch.nn.Module):
             )
 
     def core(self) -> IntCore:
-        """Return the core with its weights and biases as they stand, in integers."""
+        """Return an integer core with the trained weights and biases, rounded to int8."""
         weights = map(_whole, self.weights)
         biases = map(_whole, self.biases)
         trained = {
@@ -108,8 +113,11 @@ class TrainableCore(torch.nn.Module):
         return replace(self._core, ops=tuple(ops), host_part=host_part)
 
     def with_finer_tensors(self, names: Collection[str], by: int) -> "TrainableCore":
-        """Return a copy in which these tensors have `by` more fractional bits, or fewer if it is
-        negative.
+        """Return a copy in which some tensors have another scale, while weights and biases stay.
+
+        Args:
+            names: the names of the tensors.
+            by: the number of fractional bits to add to each; negative ones make the scale coarser.
         """
         copy = deepcopy(self)
         frac_bits = self._core.frac_bits
@@ -119,13 +127,14 @@ class TrainableCore(torch.nn.Module):
         return copy
 
     def with_finer_numbers(self, role: str, number: int, by: int) -> "TrainableCore":
-        """Return a copy in which the weights or biases of a convolution have `by` more fractional
-        bits.
+        """Return a copy in which the weights or biases of one convolution have another scale.
+
+        The values that they represent stay the same, unless they are clipped.
 
         Args:
             role: "weight" or "bias".
-            number: place of the convolution among the core's convolutions.
-            by: fractional bits to add; negative ones make the numbers coarser.
+            number: the place of the convolution among the core's convolutions.
+            by: the number of fractional bits to add; negative ones make the scale coarser.
         """
         copy = deepcopy(self)
         op = self._convs[number]
@@ -137,16 +146,28 @@ class TrainableCore(torch.nn.Module):
         return copy
 
     def forward(self, planes: Tensor) -> Tensor:
-        """Return the correction (N, C, H, W) in its own unit for int8 planes (N, P, H, W).
+        """Compute the core's result for the int8 planes of an image, in real values.
 
-        If the core writes several copies of the correction, one copy without rounding is computed
-        instead. Both tensors are float32, and gradients pass through the roundings.
+        If the core writes several copies of the result, one copy without rounding is computed
+        instead. Gradients pass through all roundings.
+
+        Args:
+            planes: (N, P, H, W) float32 integers.
+
+        Returns:
+            (N, C, H, W) float32, in the unit of the result.
         """
         return self.tensors(planes)[CORRECTION] * self._core.scale(CORRECTION)
 
     def tensors(self, planes: Tensor) -> dict[str, Tensor]:
-        """Return every tensor (N, C, H, W) by its name in integers; of a correction in copies one,
-        unrounded.
+        """Compute every tensor of the core, in integers as float32.
+
+        Args:
+            planes: (N, P, H, W) float32 integers.
+
+        Returns:
+            Each tensor (N, C, H, W) by its name, in units of its scale. If the core writes several
+            copies of the result, the last tensor is one copy, which is not rounded.
         """
         tensors = {PLANES: planes}
         parameters = iter(zip(self._convs, self.weights, self.biases, strict=True))

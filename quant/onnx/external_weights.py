@@ -22,7 +22,15 @@ from beers_deploy.quant.untrusted import FILE_BYTES, VALUE_BYTES, check_size
 
 
 def take_in(model: onnx.ModelProto, path: Path) -> None:
-    """Load the weights of a model from the file next to it into the model."""
+    """Load the weights that a model stores in a separate file into the model itself.
+
+    Args:
+        model: the parsed model, which is changed in place.
+        path: the model's file. Weights are loaded from its folder, or from folders within it.
+
+    Raises:
+        ModelError: the weights are missing, too large, or elsewhere.
+    """
     used_bytes = 0
     for tensor in model.graph.initializer:
         if tensor.data_location == TensorProto.EXTERNAL:
@@ -56,10 +64,16 @@ def network_sha256(path: Path) -> str:
 
 @contextmanager
 def unchanged(path: Path) -> Iterator[str]:
-    """Yield the digest of a network's file; raise ModelError if the file changed while it was read.
+    """Guard the reading of a network's file, and yield the file's SHA-256.
 
-    The digest is therefore that of the bytes that were parsed. It is empty if there is no file; the
-    reader then raises an error.
+    The digest is that of the bytes that are read within the block, because the file is checked
+    again at the end. It is empty if there is no file, about which the reader raises an error.
+
+    Args:
+        path: the network's file.
+
+    Raises:
+        ModelError: the file changed within the block.
     """
     before = network_sha256(path) if path.is_file() else ""
     yield before

@@ -24,15 +24,15 @@ WEIGHTS = {"Conv": 1, "ConvInteger": 1, "ConvTranspose": 1, "QLinearConv": 3}
 
 @dataclass(eq=False)
 class Node:
-    """An operator, in ONNX's words.
+    """An operator of an ONNX graph, with the names of the tensors that it reads and writes.
 
     Attributes:
         op_type: its operator, as `quant.domains.operator_name` returns it.
-        name: its own name, or that of its first result.
-        inputs: the tensors it reads; an omitted one has an empty name.
-        outputs: the tensors it writes.
-        attributes: those that it states, strings decoded.
-        proto: the message it was read from; inputs and outputs may have changed since.
+        name: the node's own name, or that of its first result if it has none.
+        inputs: the tensors that it reads; an omitted one has an empty name.
+        outputs: the tensors that it writes.
+        attributes: the attributes that the file states, with strings decoded.
+        proto: the message that it was read from; inputs and outputs may have changed since.
     """
 
     op_type: str
@@ -44,7 +44,13 @@ class Node:
 
     @classmethod
     def of(cls, proto: NodeProto, functions: Functions = ()) -> "Node":
-        """Return the node of a file that may define functions."""
+        """Build a node from its message in a file.
+
+        Args:
+            proto: the message.
+            functions: domain and name of each function that the file defines, as `functions_of`
+                returns them.
+        """
         op_type = operator_name(proto, functions)
         name = proto.name or proto.output[0]
         inputs = tuple(proto.input)
@@ -54,14 +60,22 @@ class Node:
     def new(
         cls, op_type: str, inputs: Sequence[str], output: str, name: str, **attributes: Any
     ) -> "Node":
-        """Return a node of one result."""
+        """Build a node that writes one tensor.
+
+        Args:
+            op_type: an operator of ONNX.
+            inputs: the names of the tensors that it reads.
+            output: the name of the tensor that it writes.
+            name: the name of the node.
+            attributes: the attributes of the operator.
+        """
         return cls.of(helper.make_node(op_type, inputs, [output], name, **attributes))
 
     def __str__(self) -> str:
         return f"{self.op_type} {self.name}"
 
     def written(self) -> NodeProto:
-        """Return the current message of the node."""
+        """Return the node as a message for a file, with its current inputs and outputs."""
         proto = NodeProto()
         proto.CopyFrom(self.proto)
         proto.input[:] = self.inputs
@@ -69,12 +83,16 @@ class Node:
         return proto
 
     def window(self, kernel: Sequence[int] = (), size: Pair = (0, 0)) -> tuple[Pair, Window] | None:
-        """Return its kernel and its window; None if the node states none.
+        """Return the kernel of a convolution or pool, and how it moves over the map.
 
         Args:
-            kernel: sides of its weights; empty to use the node's own attribute.
+            kernel: rows and columns of its weights; empty to use the node's own attribute.
             size: height and width of the map that it reads, from which `auto_pad` is computed. A
                 size that differs by whole strides gives the same pads.
+
+        Returns:
+            Rows and columns of the kernel, and strides, pads and dilations; None if the node states
+            none.
         """
         attribute = self.attributes.get
         sides = (
@@ -96,7 +114,9 @@ class Node:
 
     @property
     def output_padding(self) -> Sequence[int]:
-        """Rows and columns that a transposed convolution adds behind its result."""
+        """The numbers of rows and columns that a transposed convolution adds at the end of its
+        result.
+        """
         return self.attributes.get("output_padding", (0, 0))  # type: ignore[no-any-return]
 
 
@@ -105,16 +125,19 @@ Rewriting = Callable[["OnnxGraph", Node], list[Node] | None]
 
 
 class OnnxGraph:
-    """The nodes of a model in order, except those that only hold a constant.
+    """The graph of an ONNX model for reading and editing.
+
+    Nodes that only hold a constant count as constants. Edits reach the model when `save` is called.
 
     Attributes:
-        nodes: in order.
+        nodes: the nodes in order.
         constants: initializers and the values of Constant nodes, by name.
-        inputs: tensors that are no constants, with their sizes, 0 if the file states none.
-        types: ONNX's number of the type of each input.
+        inputs: the sizes of each tensor that is fed to the model, by name; 0 for a free size.
+        types: ONNX's number of the element type of each of these inputs, by name.
         outputs: the names of the results.
-        result_sizes: their sizes, 0 if the file states none; empty if it states no rank.
-        readers: for each tensor the nodes that read it, one as often as it does.
+        result_sizes: the sizes of each result by name, 0 for a free size; empty if the file does
+            not state the rank.
+        readers: for each tensor the nodes that read it. A node that reads it twice is listed twice.
         writers: for each tensor the node that writes it.
     """
 
@@ -138,7 +161,7 @@ class OnnxGraph:
         self.set_nodes([node for node in nodes if node.op_type != "Constant"])
 
     def set_nodes(self, nodes: list[Node]) -> None:
-        """Put nodes in the place of the present ones."""
+        """Replace all nodes, and update the readers and writers of tensors."""
         self.nodes = nodes
         self.readers: dict[str, list[Node]] = defaultdict(list)
         self.writers: dict[str, Node] = {}
@@ -149,9 +172,13 @@ class OnnxGraph:
             self.writers.update((name, node) for name in node.outputs if name)
 
     def rewrite(self, rewriting: Rewriting) -> None:
-        """Replace each node, in order, by what `rewriting(graph, node)` returns for it.
+        """Apply a pass to the graph: replace each node, in order, by the nodes that the pass
+        returns for it.
 
-        Readers are those from before the pass; writers are up to date.
+        During the pass `readers` are those of the graph before it, and `writers` are up to date.
+
+        Args:
+            rewriting: the pass, a function of the graph and a node; None leaves the node as it is.
         """
         nodes: list[Node] = []
         for node in self.nodes:
@@ -164,7 +191,10 @@ class OnnxGraph:
         self.set_nodes(nodes)
 
     def save(self) -> None:
-        """Write the nodes that lead to an output, and the constants, into the model."""
+        """Write the nodes and constants into the model that the graph was built from.
+
+        Nodes that lead to no output are dropped.
+        """
         needed = set(self.outputs)
         nodes: list[Node] = []
         # Backwards, because a node is needed only where something behind it reads its result.
@@ -183,7 +213,11 @@ class OnnxGraph:
         )
 
     def tensor_types(self) -> dict[str, TypeProto.Tensor]:
-        """Infer the type and the sizes of each tensor of the model; empty if its sizes conflict."""
+        """Infer the element type and the sizes of each tensor by ONNX's shape inference.
+
+        Returns:
+            ONNX's types by tensor name; empty if the stated sizes contradict each other.
+        """
         try:
             graph = shape_inference.infer_shapes(self._model).graph
         except shape_inference.InferenceError:
@@ -192,21 +226,36 @@ class OnnxGraph:
         return {value.name: value.type.tensor_type for value in values}
 
     def n_reads(self, name: str) -> int:
-        """Return how often a tensor is read, by nodes and as a result."""
+        """Return the number of times a tensor is read, by nodes and as a result of the model."""
         return len(self.readers.get(name, ())) + self.outputs.count(name)
 
     def sole_writer(self, name: str) -> Node | None:
-        """Return the node that writes a tensor; None if the tensor is not read exactly once."""
+        """Return the node that writes a tensor which is read exactly once; None for any other
+        tensor.
+
+        Passes use it to change the node, because no other reader is affected.
+        """
         return self.writers.get(name) if self.n_reads(name) == 1 else None
 
     def rename(self, result: str, name: str) -> None:
-        """Rename a result to that of the tensor that it replaces."""
+        """Let the node that writes one tensor write another instead, whose node is then not needed.
+
+        Args:
+            result: the tensor that the node writes.
+            name: the tensor that it writes from now on.
+        """
         writer = self.writers[result]
         self.writers[name] = writer
         writer.outputs = tuple(name if output == result else output for output in writer.outputs)
 
     def add_constant(self, name: str, value: np.ndarray, dtype: DTypeLike = np.float32) -> str:
-        """Store a constant of this type under a name that is free, and return the name."""
+        """Store a constant under a free name, and return that name.
+
+        Args:
+            name: the name to use; a number is added if it is taken.
+            value: the constant, of any shape.
+            dtype: the type in which it is stored.
+        """
         name = free_name(name, self._name_counts)
         self.constants[name] = value.astype(dtype)
         return name
@@ -220,11 +269,11 @@ class OnnxGraph:
         bias: np.ndarray | None = None,
         **attributes: Any,
     ) -> Node:
-        """Return a convolution, and store its weights.
+        """Build a convolution node, and store its weights and bias as constants of the graph.
 
         Args:
-            source: the tensor that it reads.
-            output: the tensor that it writes.
+            source: the name of the tensor that it reads.
+            output: the name of the tensor that it writes.
             name: the name of the node.
             weight: (O, I / groups, kh, kw), stored as float32.
             bias: (O,), stored as float32; None for none.
@@ -237,7 +286,15 @@ class OnnxGraph:
         return Node.new("Conv", inputs, output, name, **attributes)
 
     def value(self, node: Node, place: int) -> np.ndarray | None:
-        """Return the constant that a node reads; None if it reads none there."""
+        """Return the constant that a node reads as one of its inputs.
+
+        Args:
+            node: the node.
+            place: the number of the input, from 0 on.
+
+        Returns:
+            The constant; None if the input is omitted, or computed by other nodes.
+        """
         return self.constants.get(node.inputs[place]) if place < len(node.inputs) else None
 
     def numbers(
@@ -246,7 +303,14 @@ class OnnxGraph:
         """Return the numbers that a node states in a constant input or, in older opsets, in an
         attribute.
 
-        None if other nodes compute it.
+        Args:
+            node: the node.
+            place: the number of the input, from 0 on.
+            key: the name of the attribute.
+            otherwise: the numbers that are returned if the node states none.
+
+        Returns:
+            The numbers; None if other nodes compute the input.
         """
         if place < len(node.inputs) and node.inputs[place]:
             value = self.value(node, place)
@@ -270,22 +334,22 @@ def constants(model: onnx.ModelProto) -> dict[str, np.ndarray]:
 
 
 def attributes_of(node: NodeProto) -> dict[str, Any]:
-    """Return the attributes that a node states, by name, with byte strings decoded to str."""
+    """Return the attributes that a node of a file states, by name, with byte strings decoded."""
     values = {a.name: helper.get_attribute_value(a) for a in node.attribute}
     return {k: v.decode(errors="replace") if isinstance(v, bytes) else v for k, v in values.items()}
 
 
 def sizes_of(tensor: TypeProto.Tensor) -> tuple[int, ...]:
-    """Return the sizes of a tensor, 0 where none is stated."""
+    """Return the sizes that ONNX's type of a tensor states; 0 for a size that is not stated."""
     return tuple(dim.dim_value for dim in tensor.shape.dim)
 
 
 def free_name(name: str, taken: dict[str, int]) -> str:
-    """Return the name, or one like it that is free, and note it in `taken`.
+    """Return a name that is not in use, and mark it as used.
 
     Args:
-        name: the name to begin with.
-        taken: the number of names that were derived from each name.
+        name: the name to use; a suffix is added if it is in use.
+        taken: the number of names that were derived from each used name. It is changed.
     """
     candidate = name
     while candidate in taken:

@@ -10,7 +10,9 @@ from onnx import GraphProto
 
 
 def sort_nodes(graph: GraphProto) -> None:
-    """Sort the nodes of a graph in place, unless they are sorted or form a cycle.
+    """Sort the nodes of a graph in place, so that each reads only tensors that were written before.
+
+    Nothing is changed if they are sorted already, or if they form a cycle.
 
     Args:
         graph: the graph of a file that has not been checked.

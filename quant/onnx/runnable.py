@@ -47,10 +47,13 @@ FILLING = {"ConstantOfShape", "Expand", "Tile"}
 
 
 def check_runnable(model: onnx.ModelProto, where: str) -> None:
-    """Raise ModelError if no runtime should open a model.
+    """Raise ModelError if a model is not safe or not possible to run.
+
+    Its operators must be ONNX's own, or those of onnxruntime that this project writes, and no node
+    may make a tensor of a size that the file does not bound.
 
     Args:
-        model: to be checked.
+        model: the model, the content of which was checked.
         where: name of the network for the message, such as "a.onnx" or "the float network".
     """
     for function in model.functions:
@@ -136,7 +139,7 @@ def _computed(
 
 
 def named(node: NodeProto) -> str:
-    """Return operator and name of a node, for a sentence."""
+    """Return the operator and the name of a node as text for a sentence, such as "Conv head"."""
     return f"{node.op_type} {node.name}".strip()
 
 

@@ -24,17 +24,24 @@ class Window:
     dilations: Pair = (1, 1)
 
     def extent(self, axis: int, kernel: int) -> int:
-        """Return the pixels from the first to the last that it reads."""
-        return (kernel - 1) * self.dilations[axis] + 1
-
-    def output_size(self, axis: int, kernel: int, size: int, ceil: bool = False) -> int:
-        """Return the number of places of the window on `size` pixels.
+        """Return the number of pixels from the first to the last that the window reads along an
+        axis.
 
         Args:
             axis: 0 for the rows, 1 for the columns.
-            kernel: side of the window along the axis.
-            size: pixels of the map along the axis.
-            ceil: whether the last window may reach beyond the padding.
+            kernel: the number of pixels that the window reads along the axis.
+        """
+        return (kernel - 1) * self.dilations[axis] + 1
+
+    def output_size(self, axis: int, kernel: int, size: int, ceil: bool = False) -> int:
+        """Return the number of positions of the window along an axis, which is the size of the
+        result.
+
+        Args:
+            axis: 0 for the rows, 1 for the columns.
+            kernel: the number of pixels that the window reads along the axis.
+            size: the number of pixels of the map along the axis.
+            ceil: True if the last window may reach beyond the padding (ONNX's `ceil_mode`).
         """
         stride = self.strides[axis]
         before = self.pads[axis]
@@ -46,14 +53,27 @@ class Window:
         return min(-(-room // stride), (size + before - 1) // stride) + 1
 
     def transposed_size(self, axis: int, kernel: int, size: int) -> int:
-        """Return the size of a transposed convolution's result for `size` pixels."""
+        """Return the size of a transposed convolution's result along an axis.
+
+        Args:
+            axis: 0 for the rows, 1 for the columns.
+            kernel: the number of weights along the axis.
+            size: the number of pixels of the map that is read.
+        """
         beyond = self.extent(axis, kernel) - self.pads[axis] - self.pads[axis + 2]
         return self.strides[axis] * (size - 1) + beyond
 
     def padded(self, auto_pad: str, kernel: Pair, size: Pair) -> "Window":
-        """Return the window with the pads that `auto_pad` means for a map of this size.
+        """Return the window with the pads that ONNX's attribute `auto_pad` means for a map of one
+        size.
 
-        With SAME the window has size / stride places, rounded up.
+        With SAME_UPPER and SAME_LOWER the window has size / stride positions, rounded up. With
+        VALID nothing is padded.
+
+        Args:
+            auto_pad: "SAME_UPPER", "SAME_LOWER" or "VALID".
+            kernel: rows and columns of the kernel.
+            size: rows and columns of the map.
         """
         total = (0, 0)
         if auto_pad != "VALID":

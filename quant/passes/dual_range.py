@@ -23,17 +23,26 @@ MAX_CHANNELS = 4096
 
 
 def can_write_copies(graph: Graph) -> bool:
-    """Return True if the last operation is a convolution that can write its channels twice."""
+    """Return True if the last operation is a convolution that can write each of its channels
+    several times.
+
+    It must not be depthwise, and must have no activation.
+    """
     last = graph[-1]
     return isinstance(last, Conv) and last.activation is Activation.none and last.groups == 1
 
 
 def with_copies(graph: Graph, decoding: OutputDecoding) -> Graph:
-    """Return the graph whose last convolution writes the copies that the host decodes.
+    """Return the graph whose last convolution writes each result channel in all copies that the
+    host decodes.
 
     Args:
-        graph: plane-reading; if there are several copies, `can_write_copies` is True for it.
-        decoding: the host's.
+        graph: a float graph that reads the int8 planes that an image is split into. If the decoding
+            has several copies, `can_write_copies` must be True for it.
+        decoding: the host's decoding, which states the copies and the factor of each.
+
+    Returns:
+        The graph; `graph` itself if there is one copy only.
     """
     if decoding.copies == 1:
         return graph
@@ -50,14 +59,20 @@ def with_copies(graph: Graph, decoding: OutputDecoding) -> Graph:
 def with_windows(
     graph: Graph, host_part: HostPart, frac_bits: int, images: Iterable[np.ndarray]
 ) -> HostPart:
-    """Return the host part with windows over the whole float range of the result, if the result
-    needs any.
+    """Return a host part that decodes the result from int8 windows over its float range, if that
+    helps.
+
+    A window is a copy of the result that is clipped outside a part of the range, and finer by GAIN
+    than one copy over all of it.
 
     Args:
-        graph: a float graph that reads the planes.
-        host_part: the host part of the network.
-        frac_bits: the fractional bits of the result's own scale; windows are finer by GAIN.
-        images: (1, C, H, W) on which the result's range is measured.
+        graph: a float graph that reads the int8 planes that an image is split into.
+        host_part: the host's pre- and post-processing around the network.
+        frac_bits: the number of fractional bits of the result's scale as a single copy.
+        images: calibration images (1, C, H, W), on which the range of the result is measured.
+
+    Returns:
+        The host part with windows; `host_part` itself if the result needs none.
     """
     plain = host_part.decoding.copies == 1 and not host_part.adds_image
     # 3. One convolution of the DPU has to write the coarse copy and a window at the least.
@@ -74,8 +89,17 @@ def with_windows(
 
 
 def window_offsets(low: np.ndarray, high: np.ndarray, unit: float) -> np.ndarray:
-    """Return the middles (W, C) of the int8 windows, with the step `unit`, that cover low to high,
-    (C,) each.
+    """Return the middles of the int8 windows that together cover a range, side by side.
+
+    Their number is at most MAX_WINDOWS, even if the range is too wide for so many.
+
+    Args:
+        low: (C,) the smallest value of each channel.
+        high: (C,) the largest value of each channel.
+        unit: the scale of the windows, in the unit of the values.
+
+    Returns:
+        (W, C) the middle of each window, in the unit of the values.
     """
     # The coarse copy takes one of the places that a convolution's channels have.
     most = min(MAX_WINDOWS, MAX_CHANNELS // len(low) - 1)

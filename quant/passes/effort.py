@@ -62,15 +62,15 @@ TURNS = 4
 
 
 def channel_groups(ranges: np.ndarray, most: int) -> list[np.ndarray]:
-    """Divide channels into groups of similar range, whose factors are tried together.
+    """Divide channels into groups of similar range, each of which is tried with one common factor.
 
     Args:
-        ranges: the ranges of the channels, (C,).
+        ranges: (C,) the ranges of the channels.
         most: the maximum number of groups; 0 for none. If it is at least C, each channel is a group
             of its own.
 
     Returns:
-        The numbers of the channels of each group.
+        The numbers of the channels in each group.
     """
     if most >= len(ranges):
         return list(np.arange(len(ranges))[:, None])
@@ -79,12 +79,14 @@ def channel_groups(ranges: np.ndarray, most: int) -> list[np.ndarray]:
 
 @dataclass(frozen=True)
 class Stage:
-    """One search: of a residual group, of a tensor, or of all single tensors together.
+    """One separate search for factors: of a residual group, of a tensor, or of all single tensors
+    together.
 
     Attributes:
-        tensors: the tensors whose channels are scaled.
-        guesses: number of first guesses.
-        channels: number of channels that are tried larger and smaller; 0 for first guesses alone.
+        tensors: the names of the tensors whose channels are scaled.
+        guesses: the number of first guesses that are tried.
+        channels: the number of channels that are tried with larger and smaller factors; 0 for first
+            guesses alone.
     """
 
     tensors: Collection[str]
@@ -92,19 +94,26 @@ class Stage:
     channels: int = 0
 
     def candidates(self, groups: int) -> int:
-        """Return the largest number of candidates for a number of groups of channels."""
+        """Return the largest number of networks that the search tries.
+
+        Args:
+            groups: the number of groups into which channels are divided, each of which has one
+                factor.
+        """
         return self.guesses + TURNS * min(groups, self.channels)
 
 
 @dataclass(frozen=True)
 class Bound:
-    """The bound of a search.
+    """The amount of work to which the search for equalization factors is limited.
 
     Attributes:
-        groups: the maximum number of groups of channels of a tensor or residual group.
-        crops: the number of crops on which candidates are run.
+        groups: the maximum number of groups into which the channels of a tensor or residual group
+            are divided.
+        crops: the number of crops of calibration images on which a candidate network is run.
         candidates: the maximum number of candidates.
-        runs: likely work, in runs of the first candidate on all crops.
+        runs: the likely work of the whole search, over the work of running the first candidate on
+            all crops.
     """
 
     groups: int
@@ -116,14 +125,16 @@ class Bound:
 def bound(
     stages: Sequence[Stage], graph: Graph, work: Sequence[int], crops: int, effort: Effort
 ) -> Bound:
-    """Return the bound of a search.
+    """Decide how many groups of channels and crops a search uses, so that its work stays within
+    limits.
 
     Args:
-        stages: the stages of the search.
-        graph: the graph that is searched.
-        work: the work of each operation on one crop.
-        crops: the number of crops, if there is no bound.
-        effort: allowed.
+        stages: the separate searches.
+        graph: the float graph whose channels are scaled.
+        work: the work of each operation on one crop, in multiply-accumulates, as `work_of` returns
+            it.
+        crops: the number of crops that is used if no limit applies.
+        effort: the effort that the user allows. The limits do not apply to `best`.
     """
 
     def of_candidate(stage: Stage, crops: float) -> float:
@@ -152,13 +163,32 @@ def bound(
 
 
 def span(graph: Graph, names: Collection[str]) -> tuple[int, int]:
-    """Return where the operations that write or read these tensors begin and end."""
+    """Return the range of the operations that write or read some tensors, and of all between them.
+
+    Args:
+        graph: the operations in order.
+        names: the names of the tensors, at least one of which occurs.
+
+    Returns:
+        The place of the first such operation, and the place behind the last.
+    """
     places = [k for k, op in enumerate(graph) if not {*op.inputs, op.output}.isdisjoint(names)]
     return places[0], places[-1] + 1
 
 
 def work_of(graph: Graph, host_part: HostPart, crop: np.ndarray) -> list[int]:
-    """Return the work of each operation on a crop (1, C, h, w)."""
+    """Count the work of each operation on one crop, in multiply-accumulates.
+
+    Rounding a result counts as the number of multiply-accumulates that take as long.
+
+    Args:
+        graph: a float graph that reads the int8 planes that an image is split into.
+        host_part: the host's pre- and post-processing around the graph.
+        crop: (1, C, h, w) a part of an image.
+
+    Returns:
+        The work of each operation, in the order of the graph.
+    """
     # 1.
     (results,) = values_of(graph, tensors(graph), [crop], host_part)
     return [result.size * _of_result(op) for op, result in zip(graph, results, strict=True)]

@@ -56,7 +56,16 @@ Each check doubles the crops. Some 30 % of the runs remain.
 
 
 def equalize(graph: Graph, group: ResidualGroup, factors: np.ndarray) -> Graph:
-    """Return the same network with channel c of a group scaled by factors[c], (C,) above 0."""
+    """Scale the channels of a residual group by factors, without changing the function of the float
+    network.
+
+    Weights that write a channel are multiplied by its factor, and weights that read it are divided.
+
+    Args:
+        graph: the float graph.
+        group: the tensors whose channels are scaled.
+        factors: (C,) the factor of each channel of the group, above 0.
+    """
     factors = np.array(factors, np.float64)
     for op in graph:
         if isinstance(op, Conv) and op.output in group and op.activation is Activation.relu6:
@@ -100,8 +109,19 @@ def channel_ranges(
     images: Iterable[np.ndarray],
     host_part: HostPart = ONE_CHANNEL,
 ) -> np.ndarray:
-    """Return the range of each channel, (C,), over images (1, C', H, W): the widest of all the
-    group's tensors.
+    """Measure the range of each channel of a group: the largest of all the group's tensors.
+
+    The range of a tensor's channel is the QUANTILE of its absolute values in a tile, as the mean
+    over tiles.
+
+    Args:
+        graph: a float graph that reads the int8 planes that an image is split into.
+        group: the tensors of the group.
+        images: calibration images (1, C', H, W).
+        host_part: the host's pre- and post-processing around the graph.
+
+    Returns:
+        (C,) the ranges, in the tensors' unit.
     """
     names = sorted(group)
     tiles = channel_sizes(graph, names, images, host_part)
@@ -123,15 +143,17 @@ def channel_sizes(
     host_part: HostPart = ONE_CHANNEL,
     quantile: float = QUANTILE,
 ) -> Iterator[list[np.ndarray]]:
-    """Yield, for every tile of the images, a quantile of the absolute values of each channel: (C,)
-    per tensor.
+    """Yield, for every tile of the images, a quantile of the absolute values of each channel.
 
     Args:
-        graph: a float graph that reads the planes.
+        graph: a float graph that reads the int8 planes that an image is split into.
         names: the names of the tensors.
-        images: (1, C', H, W).
-        host_part: the host part of the graph.
-        quantile: the quantile of the absolute values.
+        images: calibration images (1, C', H, W).
+        host_part: the host's pre- and post-processing around the graph.
+        quantile: the quantile, in [0, 1].
+
+    Yields:
+        One array (C,) per tensor, in the order of `names`.
     """
     for results in values_of(graph, names, images, host_part):
         sizes = [np.abs(r[0]).reshape(r.shape[1], -1) for r in results]
@@ -139,20 +161,29 @@ def channel_sizes(
 
 
 def above_dead(ranges: np.ndarray) -> np.ndarray:
-    """Raise ranges (C,) that are nearly zero to a minimum, so that dead channels are
+    """Raise ranges that are nearly zero to a minimum, so that channels that are never active are
     not amplified.
+
+    Args:
+        ranges: (C,) the ranges of the channels.
     """
     return np.asarray(np.maximum(ranges, 1e-3 * float(ranges.max()) + 1e-12))
 
 
 def first_guess(ranges: np.ndarray, gamma: float, headroom: float) -> np.ndarray:
-    """Return factors that equalize the ranges, and scale the widest to int8.
+    """Return factors that make the ranges of channels more equal, and that fit the widest one into
+    int8.
+
+    The factor of a channel is proportional to range^-gamma.
 
     Args:
-        ranges: the ranges of the channels, (C,).
-        gamma: exponent of the equalization; 0 leaves the ratios of the ranges unchanged, 1 makes
-            all equal.
-        headroom: the widest range as a share of int8's.
+        ranges: (C,) the ranges of the channels.
+        gamma: the exponent; 0 leaves the ratios of the ranges unchanged, 1 makes all equal.
+        headroom: the widest range after scaling, as a share of int8's range. Above 1 the largest
+            values are clipped.
+
+    Returns:
+        (C,) the factors.
     """
     factors = (ranges.max() / ranges) ** gamma
     return np.asarray(factors * headroom * FULL / (ranges * factors).max())
@@ -165,14 +196,19 @@ def search(
     trial: Trial,
     channels: Sequence[np.ndarray],
 ) -> np.ndarray:
-    """Return the factors of least error: the best first guess, then step by step.
+    """Search the factors of a group's channels with which the INT8 network errs least.
+
+    It tries the first guesses, then larger and smaller factors for each set of channels.
 
     Args:
-        graph: the graph of which the group is.
-        group: to be equalized.
-        ranges: the ranges of its channels, (C,).
-        trial: returns the error of a candidate graph on crops.
-        channels: the numbers of those that are tried larger and smaller together.
+        graph: the float graph.
+        group: the residual group whose channels are scaled.
+        ranges: (C,) the ranges of its channels.
+        trial: measures the error of a candidate graph in INT8 on crops.
+        channels: sets of channel numbers. The channels of a set are tried with one common factor.
+
+    Returns:
+        (C,) the best factors.
     """
 
     def costs_of(factors: np.ndarray) -> Costs:
@@ -193,12 +229,13 @@ def search(
 def stepped(
     costs_of: Callable[[np.ndarray], Costs], channels: Sequence[np.ndarray], best: "Best"
 ) -> "Best":
-    """Try groups of channels larger and smaller, and return the best factors.
+    """Try larger and smaller factors for one set of channels after the other, and return the best
+    factors.
 
     Args:
-        costs_of: returns the trial of some factors.
-        channels: the numbers of the channels of each group.
-        best: the best factors so far.
+        costs_of: returns, for factors (C,), the function that measures their error on crops.
+        channels: sets of channel numbers. The channels of a set are multiplied by a common number.
+        best: the factors to start from, with their error.
     """
     trials = list(product(STEPS, channels))
     with steps("groups of channels", len(trials)) as bar:
@@ -217,20 +254,26 @@ def stepped(
 
 @dataclass(frozen=True)
 class Best:
-    """The best factors so far, (C,), and their error on each crop, (N,)."""
+    """The best equalization factors found so far.
+
+    Attributes:
+        factors: (C,) the factor of each channel.
+        costs: (N,) the error of the INT8 network with these factors, on each of the N crops.
+    """
 
     factors: np.ndarray
     costs: np.ndarray
 
 
 def race(costs_of: Costs, factors: np.ndarray, best: Best) -> Best:
-    """Return the better of two candidates.
+    """Measure new factors on crop after crop, and return the better of them and the best so far.
 
-    The costliest crops come first: six of seven trials fail, and most of them show it on two crops.
+    The crops on which the best so far errs most come first. Six of seven candidates fail, and most
+    of them show it on two crops, so that the others need not be run.
 
     Args:
-        costs_of: returns the error of the new factors on some crops.
-        factors: the new factors, (C,).
+        costs_of: returns the error of the new factors on the crops of given numbers.
+        factors: (C,) the new factors.
         best: the best factors so far.
     """
     order = np.argsort(-best.costs, kind="stable")

@@ -76,15 +76,16 @@ def _guess(ranges: np.ndarray, weights: np.ndarray, gamma: float, headroom: floa
 
 @dataclass(frozen=True)
 class SingleTensors:
-    """Tensors that may be equalized by themselves, not as members of a residual group.
+    """Tensors that only convolutions write and read, so that each may be equalized by itself.
 
-    Factors and ranges of all of them are one array (sum of the channels,), tensor behind tensor.
+    They are no members of a residual group. Factors and ranges of all of them are stored in one
+    array (sum of the channels,), one tensor behind the other.
 
     Attributes:
-        tensors: their names, in the graph's order.
-        widths: the number of channels of each.
-        by_channel: True if the search tries groups of channels. It gains nothing in a network that
-            has a residual group too.
+        tensors: the names of the tensors, in the order of the graph.
+        widths: the number of channels of each tensor.
+        by_channel: True if the search also tries larger and smaller factors for single groups of
+            channels. That gains nothing in a network that has a residual group too.
     """
 
     tensors: tuple[str, ...]
@@ -93,24 +94,36 @@ class SingleTensors:
 
     @property
     def parts(self) -> dict[str, slice]:
-        """The slice of each tensor's channels."""
+        """The slice of each tensor's channels in the arrays of factors and ranges, by the tensor's
+        name.
+        """
         ends = np.cumsum([0, *self.widths]).tolist()
         return dict(zip(self.tensors, map(slice, ends, ends[1:]), strict=True))
 
     def tried_alone(self, most_groups: int) -> tuple[str, ...]:
-        """Return the tensors that are tried one by one."""
+        """Return the names of the tensors whose factors are also searched one tensor at a time.
+
+        Args:
+            most_groups: the maximum number of groups of channels; with 0 no tensor is tried alone.
+        """
         few = self.by_channel or len(self.tensors) <= FEW_TENSORS
         return self.tensors if few and most_groups else ()
 
     def guesses_alone(self, effort: Effort) -> bool:
-        """Return True if the first guesses are also tried on each tensor.
+        """Return True if the first guesses are also tried on one tensor at a time, not only on all
+        jointly.
 
         Where groups of channels are tried, this gained nothing (measured).
         """
         return not self.by_channel or effort is Effort.best
 
     def stages(self, effort: Effort) -> list[Stage]:
-        """Return the stages of the search for their factors."""
+        """Return the separate searches for factors: one of all tensors jointly, then one for each
+        tensor tried alone.
+
+        Args:
+            effort: the effort that the user allows.
+        """
         guesses = len(GAMMAS) * len(HEADROOM)
         alone = guesses if self.guesses_alone(effort) else 0
         widths = dict(zip(self.tensors, self.widths, strict=True))
@@ -123,13 +136,29 @@ class SingleTensors:
         ]
 
     def scaled(self, graph: Graph, factors: np.ndarray) -> Graph:
-        """Return the same network with each channel scaled by its factor."""
+        """Scale all channels by their factors, without changing the function of the float network.
+
+        Args:
+            graph: the float graph to which the tensors belong.
+            factors: (sum of the channels,) the factors, above 0.
+        """
         for name, part in self.parts.items():
             graph = equalize(graph, only(name), factors[part])
         return graph
 
     def unscaled(self, frac_bits: Mapping[str, int]) -> np.ndarray:
-        """Return the factors that leave the scale of every tensor unchanged."""
+        """Return the factors with which int8 covers the same range of each tensor as at the
+        tensor's own scale.
+
+        In the core all equalized tensors have GROUP_FRAC_BITS fractional bits, so a power of two
+        makes up for the difference.
+
+        Args:
+            frac_bits: the number of fractional bits of each tensor's own scale, by its name.
+
+        Returns:
+            (sum of the channels,) powers of two.
+        """
         # In the core these tensors have the groups' scale, so the factor stands for their own.
         scales = [2.0 ** (frac_bits[name] - GROUP_FRAC_BITS) for name in self.tensors]
         return np.repeat(scales, self.widths)
@@ -143,15 +172,21 @@ def single_ranges(
     quantile: float = QUANTILE,
     tiles: float = TILES,
 ) -> np.ndarray:
-    """Return the range of every channel over images (1, C, H, W) that most tiles stay within.
+    """Measure the range of every channel of the tensors: the one that most tiles of the images stay
+    within.
 
     Args:
-        graph: the graph of which the tensors are.
+        graph: the float graph to which the tensors belong. It reads the int8 planes that an image
+            is split into.
         singles: the tensors.
-        images: the images that are cut to tiles.
-        host_part: the host part of the graph.
-        quantile: the quantile of a channel's absolute values in a tile; 1 returns the largest.
-        tiles: the quantile of these over the tiles.
+        images: calibration images (1, C, H, W), which are cut to tiles.
+        host_part: the host's pre- and post-processing around the graph.
+        quantile: the quantile of a channel's absolute values that is its range in one tile; 1 means
+            the largest value.
+        tiles: the quantile of these ranges over the tiles.
+
+    Returns:
+        (sum of the channels,) the ranges, in the tensors' unit.
     """
     sizes = channel_sizes(graph, list(singles.tensors), images, host_part, quantile)
     by_tensor = zip(*sizes, strict=True)
@@ -167,17 +202,20 @@ def equalize_single(
     effort: Effort,
     most_groups: int,
 ) -> np.ndarray:
-    """Return the factors of least error, never more than that of `start`.
+    """Search the factors of all channels with which the INT8 network errs least.
 
     Args:
-        graph: the graph of which the tensors are.
-        singles: to be equalized.
-        ranges: the ranges of their channels, (sum of the channels,).
-        start: factors, of the same shape.
-        trials: measure the error of candidate graphs on crops.
-        effort: the effort of the search.
-        most_groups: most groups of channels that are tried larger and smaller; 0 for the guesses
-            for all tensors alone.
+        graph: the float graph to which the tensors belong.
+        singles: the tensors whose channels are scaled.
+        ranges: (sum of the channels,) the ranges of the channels.
+        start: (sum of the channels,) the factors to start from.
+        trials: measures the error of candidate graphs in INT8 on crops.
+        effort: the effort that the user allows.
+        most_groups: the maximum number of groups of channels in a tensor, each of which is tried
+            larger and smaller; 0 tries only the guesses for all tensors jointly.
+
+    Returns:
+        (sum of the channels,) the best factors; `start` if nothing is better.
     """
     weights_of = {
         op.output: np.abs(op.weight).max((1, 2, 3)) for op in graph if isinstance(op, Conv)

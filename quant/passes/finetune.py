@@ -64,13 +64,13 @@ JUDGING = 48
 
 @dataclass(frozen=True)
 class Pace:
-    """How far the steps of a round go.
+    """The size of the gradient steps in one round of fine-tuning.
 
     Attributes:
-        share: the share of the highest rate.
-        by_tensor: whether a gradient is divided by the root mean square of its whole tensor, and
-            not number by number, as Adam does. Number by number, small gradients that are mostly
-            noise move their numbers as far as others. Once all these cross their rounding
+        share: the learning rate at the start of the round, as a share of the highest rate.
+        by_tensor: True divides a gradient by the root mean square of its whole tensor; False
+            divides each number's gradient by its own, as Adam does. Then small gradients that are
+            mostly noise move their numbers as far as others. Once all these cross their rounding
             thresholds, the error multiplies: a network that INT8 harms little only gets worse.
     """
 
@@ -89,11 +89,12 @@ class Tuning:
     """The parameters of fine-tuning.
 
     Attributes:
-        pairs: images (1, C, H, W) in [0, 1] and their references, which may be empty.
+        pairs: the training images (1, C, H, W) as the network reads them, and their references,
+            which may be empty.
         steps: the number of gradient steps; None adds rounds until the error on held-out pairs
             stops falling.
         rate: the highest learning rate, in units of each number's scale.
-        seed: the seed of the order of the pairs.
+        seed: the seed of the order in which pairs are drawn.
         original: the float network whose results are learnt; None for that of the rounded graph,
             which differs if operators were replaced (`quant.adapt`).
     """
@@ -107,13 +108,17 @@ class Tuning:
 
 @dataclass(frozen=True)
 class Sample:
-    """A pair for the core: an image as input, corrections (1, C, H', W') as targets.
+    """An image in the form in which the core reads it, and the results that the core should have
+    for it.
+
+    These results are corrections (1, C, H', W'): what the core computes before the host adds the
+    image.
 
     Attributes:
-        image: (1, C, H, W) in [0, 1].
-        planes: the planes of the image, (1, P, H, W) as float32.
+        image: (1, C, H, W) as the network reads it.
+        planes: the int8 planes of the image, (1, P, H, W) as float32.
         floats: the float network's correction.
-        reference: the correction that would restore it completely, or None.
+        reference: the correction with which the result would equal the reference, or None.
         weight: the weight of its errors: one over the float network's own error, so that dark and
             busy patches count equally. A number, or (N, 1, 1, 1) of a batch.
     """
@@ -126,7 +131,9 @@ class Sample:
 
     @classmethod
     def batch(cls, samples: Sequence["Sample"]) -> "Sample":
-        """Join N samples of equal size to one, which runs faster than one by one."""
+        """Join N samples of equal size to one, whose arrays have N in place of 1, because that runs
+        faster.
+        """
         references = [sample.reference for sample in samples if sample.reference is not None]
         return cls(
             np.concatenate([sample.image for sample in samples]),
@@ -137,10 +144,11 @@ class Sample:
         )
 
     def error(self, correction: Tensor) -> Tensor:
-        """Return the weighted error of a correction, which autograd can differentiate.
+        """Return the weighted error of a computed correction, as a number that autograd can
+        differentiate.
 
         Args:
-            correction: (1, C, H', W') in the unit of `floats`.
+            correction: (N, C, H', W') in the unit of `floats`.
 
         Returns:
             `weight` times the sum of two terms: the mean squared difference from the float
@@ -155,16 +163,17 @@ class Sample:
 def finetune(
     core: IntCore, full: Graph, tuning: Tuning, shifts: Shifts = SHIFTS
 ) -> tuple[IntCore, int]:
-    """Train the integers and scales of a core.
+    """Train the integers of a core, and change its scales where that reduces the error.
 
     Args:
-        core: the core to start from.
-        full: the float network that reads all planes.
+        core: the integer core to start from.
+        full: the float graph that reads the int8 planes that an image is split into, before
+            equalization.
         tuning: the training pairs, the number of steps and the learning rate.
-        shifts: the shift windows of the target.
+        shifts: the smallest and largest shifts that the target allows.
 
     Returns:
-        The core that erred least on held-out pairs, which is `core` itself if training finds
+        The core with the least error on held-out pairs, which is `core` itself if training finds
         nothing better, and the number of steps taken.
 
     Raises:
@@ -237,12 +246,12 @@ def descend(
 
     Args:
         trainable: the core, whose parameters are changed in place.
-        samples: to train on; each step draws some of them with replacement.
+        samples: the training samples; each step draws some of them with replacement.
         steps: the number of gradient steps.
-        highest_rate: the learning rate of the first step at the first pace, in units of each
+        highest_rate: the learning rate of the first step if `pace.share` is 1, in units of each
             number's scale.
-        pace: how far the steps go.
-        generator: draws the samples.
+        pace: the size of the steps.
+        generator: the generator that draws the samples.
 
     Yields:
         The number of steps that are left, before the first step and after each.
@@ -295,7 +304,7 @@ def loss_of(core: IntCore, samples: Sequence[Sample]) -> float:
 
     Args:
         core: a core, run as the host runs it in an INT8 file.
-        samples: the samples that judge it.
+        samples: the samples on which the error is measured.
 
     Returns:
         The mean of the weighted squared errors, less the mean for the float network's corrections.

@@ -23,13 +23,17 @@ def choose_frac_bits(
     host_part: HostPart = ONE_CHANNEL,
     least_squares: bool = True,
 ) -> dict[str, int]:
-    """Return the fractional bits of every tensor of a plane-reading graph.
+    """Choose the power-of-two scale of every tensor of a float graph.
 
     Args:
-        graph: in float.
-        images: (1, C, H, W) in [0, 1], which are read twice.
-        host_part: the graph's host part.
-        least_squares: whether finer scales are tried; if False, nothing is clipped.
+        graph: a float graph that reads the int8 planes that an image is split into.
+        images: calibration images (1, C, H, W) as the network reads them. They are read twice.
+        host_part: the host's pre- and post-processing around the graph.
+        least_squares: True chooses the scale of least squared error. False chooses the finest scale
+            that clips no value.
+
+    Returns:
+        The number of fractional bits of each tensor's scale, by the tensor's name.
     """
     names = tensors(graph)
     shared = tied(graph)

@@ -43,16 +43,24 @@ PASSING = (Concat, MaxPool, AveragePool, Resize)
 
 
 def only(name: str) -> ResidualGroup:
-    """Return a group that consists of one tensor."""
+    """Return one tensor as a group by itself, so that functions for residual groups accept it."""
     return {name: slice(None)}
 
 
 def residual_groups(graph: Graph) -> list[ResidualGroup]:
-    """Return the groups that can share a scale and be equalized, in the order of the graph.
+    """Find the residual groups: tensors that adds connect, and that can share one scale and be
+    equalized.
 
     Only convolutions, adds and operations that pass channels on write and read them, with nothing
-    in between that blocks a factor. Groups that a product, a pixel shuffle or the network's end
-    reads are excluded.
+    in between that blocks a factor per channel. Groups that a product, a pixel shuffle or the
+    network's end reads are excluded.
+
+    Args:
+        graph: a float graph.
+
+    Returns:
+        The groups in the order of the graph, each a dict from tensor name to the slice of the
+        group's channels.
     """
     # 1.
     linking = [op for op in graph if isinstance(op, (Add, *PASSING))]
@@ -102,8 +110,15 @@ def _links(op: Op, widths: Mapping[str, int]) -> list[tuple[str, str, int]]:
 
 
 def exceeds_six(graph: Graph, group: ResidualGroup, frac_bits: Mapping[str, int]) -> bool:
-    """Return True if a ReLU6 writes to a group, and int8 ends beyond the six in one
-    of its tensors.
+    """Return True if int8 cannot end at the value 6 in a group that a ReLU6 writes to.
+
+    Equalization would let the end of int8 replace the ReLU6's clip at 6. That fails if one of the
+    tensors needs a scale at which int8 ends beyond 6.
+
+    Args:
+        graph: the float graph.
+        group: the tensors of the group.
+        frac_bits: the number of fractional bits of each tensor's own scale, by its name.
     """
     clipped = any(
         isinstance(op, Conv) and op.activation is Activation.relu6 and op.output in group
@@ -114,8 +129,15 @@ def exceeds_six(graph: Graph, group: ResidualGroup, frac_bits: Mapping[str, int]
 
 
 def single_tensors(graph: Graph) -> list[str]:
-    """Return the tensors of no group that only convolutions write and read, so that each channel
-    may have a factor.
+    """Find the tensors that only convolutions write and read, and that belong to no residual group.
+
+    Each of their channels may be scaled by a factor of its own.
+
+    Args:
+        graph: a float graph.
+
+    Returns:
+        The names of the tensors, in the order of the graph.
     """
     # 4.
     adds = [op for op in graph if isinstance(op, Add)]

@@ -31,18 +31,20 @@ logger = logging.getLogger(__name__)
 def with_better_scales(
     trainable: TrainableCore, graph: Graph, shifts: Shifts, loss_of: Callable[[IntCore], float]
 ) -> TrainableCore:
-    """Return the core with those scales moved by one bit that reduce its error.
+    """Try each scale of a core one bit finer and coarser, and keep the changes that reduce its
+    error.
 
-    A move that reduces the error is kept before the next one is tried, so that moves add up.
+    A change that reduces the error is kept before the next one is tried, so that changes add up.
 
     Args:
-        trainable: a core in training.
-        graph: the float network of the same operations.
-        shifts: the shift windows of the target. A move that leaves them is not tried.
+        trainable: the integer core in training.
+        graph: the float graph of the same operations.
+        shifts: the smallest and largest shifts that the target allows. A change that needs others
+            is not tried.
         loss_of: returns the error of a core; smaller is better.
 
     Returns:
-        The core with the least error found; `trainable` itself if no move reduces it.
+        The core with the least error found; `trainable` itself if no change reduces it.
     """
     start = trainable.core()
     least = loss_of(start)
@@ -107,11 +109,11 @@ def _moves(core: IntCore, graph: Graph) -> Iterator[Callable[..., TrainableCore]
 
 
 def moved(core: IntCore, other: IntCore) -> int:
-    """Return the number of scales that differ between two forms of a core.
+    """Count the scales that differ between a core before and after fine-tuning.
 
     Args:
-        core: a core.
-        other: the same core, maybe with other scales.
+        core: the one core.
+        other: the other core, of the same operations.
 
     Returns:
         The number of tensors, weights and biases that have another number of fractional bits.

@@ -7,13 +7,16 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Passes:
-    """The passes that reduce the error of rounding, by name.
+    """The passes that reduce the error of rounding, each of which can be left out to measure its
+    gain.
 
     Attributes:
-        dual_range: the result is computed in two ranges or in windows, finer than its own.
-        least_squares: scales leave the least squared error; without, they clip nothing.
-        equalization: the ranges of channels are searched; without, the largest one fits and all
-            share its factor.
+        dual_range: True writes the result in several copies of different scales, which represent it
+            more finely than one.
+        least_squares: True chooses the scale of least squared error for each tensor, False the
+            finest scale that clips nothing.
+        equalization: True searches a factor for each channel. False uses one factor for all
+            channels of a residual group, at which the widest fits int8.
     """
 
     dual_range: bool = True

@@ -53,10 +53,11 @@ Targets = list[tuple[np.ndarray, np.ndarray]]
 
 
 def crop_count(crop: np.ndarray, available: int) -> int:
-    """Return the maximum number of crops of this size, (1, C, h, w), on which a search measures.
+    """Return the number of crops on which a search measures candidates: more if the crops are
+    small.
 
     Args:
-        crop: one of them.
+        crop: one of the crops, (1, C, h, w), whose size counts.
         available: the approximate number of crops; images of other sizes than the first may have
             more.
     """
@@ -68,16 +69,20 @@ def crop_count(crop: np.ndarray, available: int) -> int:
 def search_targets(
     graph: Graph, host_part: HostPart, images: Sequence[np.ndarray], count: int
 ) -> Targets:
-    """Choose crops, and restore them in float: those with the largest corrections, and others of
-    all sizes.
+    """Choose crops of the images for a search, and restore them in float.
 
-    Only the sizes of corrections are stored; the images of the selected crops are simulated again.
+    A quarter of the crops are those with the largest corrections, where int8 clips. The others have
+    corrections of all sizes. Images of the selected crops are simulated again, because only the
+    sizes of corrections are stored.
 
     Args:
-        graph: a float graph that reads the planes.
-        host_part: the host part of the graph.
-        images: (1, C, H, W).
+        graph: a float graph that reads the int8 planes that an image is split into.
+        host_part: the host's pre- and post-processing around the graph.
+        images: calibration images (1, C, H, W).
         count: the number of crops; fewer are returned if there are not enough.
+
+    Returns:
+        Pairs of a crop (1, C, h, w) and its float result.
     """
     session = open_session(graph_to_onnx(graph, [CORRECTION], host_part.planes))
     halo_px = 0 if halo_of(graph) is not None else None
@@ -104,9 +109,12 @@ def search_targets(
 
 
 def hardest_and_others(order: Sequence[T], count: int) -> list[T]:
-    """Select `count` items from a sequence that is ordered by its largest values.
+    """Select the first quarter of `count` items from the beginning of a sequence, and spread the
+    rest over it.
 
-    A quarter are the first ones, where int8 clips; the rest are spread over the others.
+    Args:
+        order: items, sorted from the largest value (the hardest crop) to the smallest.
+        count: the number of items; fewer are returned if there are not enough.
     """
     hard = count // 4
     others = order[hard :: max((len(order) - hard) // (count - hard), 1)]
@@ -114,14 +122,20 @@ def hardest_and_others(order: Sequence[T], count: int) -> list[T]:
 
 
 class CropTrials:
-    """Measures the error of candidates on crops, and runs only the changed operations again.
+    """Measures the error of candidate networks in INT8 on crops, and runs only the changed
+    operations again.
 
-    The part in front of the first changed operation is computed once. The part behind the last one
-    remains one session.
+    The results in front of the first changed operation are computed once. The operations behind the
+    last one stay open in one session.
     """
 
     def __init__(self, core_of: Callable[[Graph], IntCore], targets: Targets) -> None:
-        """Measure candidates rounded by `core_of` against the float results of `targets`."""
+        """Prepare trials.
+
+        Args:
+            core_of: rounds a candidate, which is a float graph, to an integer core.
+            targets: the crops and their float results, with which INT8 results are compared.
+        """
         self.core_of = core_of
         self.targets = targets
         # Without an image of the result's size there is no change to compare with.
@@ -131,8 +145,18 @@ class CropTrials:
         ]
 
     def __call__(self, graph: Graph, names: Collection[str]) -> Trial:
-        """Return a trial of candidates that differ from `graph` only where these tensors are
-        written and read.
+        """Return a function that measures candidates which differ from a graph in the scaling of
+        some tensors.
+
+        Args:
+            graph: the float graph that candidates are derived from.
+            names: the tensors at which they differ: only operations that write or read these are
+                changed.
+
+        Returns:
+            A function of a candidate. It returns a function of crop numbers (None for all), which
+            returns the error on each of these crops: root mean squared difference from the float
+            result, relative to the change that the float network makes.
         """
         start, stop = span(graph, names)
         core = self.core_of(graph)

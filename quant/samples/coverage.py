@@ -33,8 +33,14 @@ COVERED = 0.9
 
 @dataclass(frozen=True)
 class SampleRange:
-    """Percentiles of all pixels of a set of samples, over full scale, and the share of pixels that
-    are saturated.
+    """The part of a sensor's brightness range that a set of samples covers.
+
+    Attributes:
+        p1: the 1st percentile of all pixels, as a share of full scale.
+        p50: the median of all pixels.
+        p99: the 99th percentile.
+        p99_9: the 99.9th percentile.
+        saturated: the share of the pixels that lie in the last bin of the histogram.
     """
 
     p1: float
@@ -45,7 +51,7 @@ class SampleRange:
 
     @property
     def reaches_full_scale(self) -> bool:
-        """Return True if the samples cover bright ground."""
+        """True if the samples cover bright ground: their 99.9th percentile is at least COVERED."""
         return self.p99_9 >= COVERED
 
     def __str__(self) -> str:
@@ -56,11 +62,18 @@ class SampleRange:
         )
 
     def to_words(self) -> str:
-        """Return the range as text for the metadata of an INT8 file."""
+        """Return the range as JSON text for the metadata of an INT8 file, which `recorded_range`
+        reads.
+        """
         return json.dumps({name: round(value, 6) for name, value in asdict(self).items()})
 
     def row(self, name: str, source: str) -> Row:
-        """Return the range as a row of the table "samples"."""
+        """Return the range as a row of the table "samples".
+
+        Args:
+            name: the name of the row.
+            source: how the samples were obtained, for the figures.
+        """
         figures = {
             "1st percentile": measured(self.p1, "of full scale", source),
             "median": measured(self.p50, "of full scale", source),
@@ -72,10 +85,10 @@ class SampleRange:
 
 
 def histogram(sample: np.ndarray) -> np.ndarray:
-    """Count the pixels of a sample by value.
+    """Count the pixels of a sample by value, in BINS bins over [0, 1].
 
     Args:
-        sample: the sample of any shape, with values in [0, 1].
+        sample: values in [0, 1] of any shape.
 
     Returns:
         (BINS,) counts; the last bin also holds the value 1.
@@ -86,10 +99,10 @@ def histogram(sample: np.ndarray) -> np.ndarray:
 
 
 def range_from(counts: np.ndarray) -> SampleRange:
-    """Compute percentiles and the saturated share of samples.
+    """Compute the percentiles and the saturated share of samples from their histogram.
 
     Args:
-        counts: the sum of their histograms, (BINS,), as `histogram` returns them.
+        counts: (BINS,) the sum of the histograms of all samples, as `histogram` returns them.
     """
     shares = np.cumsum(counts) / counts.sum()
     # The numbers of the bins are digital numbers, and the last of them is full scale.
@@ -98,11 +111,17 @@ def range_from(counts: np.ndarray) -> SampleRange:
 
 
 def recorded_range(about: Mapping[str, str]) -> SampleRange | None:
-    """Return the range that the metadata of an INT8 file records; None if it records none that
-    makes sense.
+    """Return the brightness range of the calibration samples that an INT8 file records in its
+    metadata.
 
     It is the file's own claim, which nothing verifies: it may be shown, but no check may depend on
     it.
+
+    Args:
+        about: the metadata of the file.
+
+    Returns:
+        The range; None if none is recorded, or if the numbers cannot be percentiles.
     """
     try:
         # Wrong names are a TypeError of the constructor.
@@ -117,11 +136,12 @@ def recorded_range(about: Mapping[str, str]) -> SampleRange | None:
 
 
 def uncovered(judged: SampleRange, calibrated: SampleRange | None) -> str:
-    """Return a sentence if the samples of a gate leave out bright ground; else an empty string.
+    """Return a sentence for the user if the samples of a gate leave out bright ground; else an
+    empty string.
 
     Args:
-        judged: the range of the gate's samples.
-        calibrated: the range that the INT8 file claims for its calibration, None if it records
+        judged: the brightness range of the gate's samples.
+        calibrated: the range that the INT8 file records for its calibration; None if it records
             none.
     """
     if judged.reaches_full_scale:

@@ -56,13 +56,16 @@ LEAST_CONTRAST = 1 / MAX_DN
 
 @dataclass(frozen=True)
 class OwnSamples:
-    """A user's samples, which replace `quant.samples.simulated.Calibration`.
+    """A user's own samples, on which a network is calibrated and judged instead of simulated
+    patches.
+
+    They have the same properties as `quant.samples.simulated.Calibration`.
 
     Attributes:
-        name: the name of their file.
-        samples: each with its name.
-        ranges: the ranges of their channels; empty if all are in [0, 1].
-        stated: whether the user states the ranges.
+        name: the name of the file or folder that they were read from.
+        samples: the images and references, each pair with its name.
+        ranges: the range (low, high) of each channel; empty if all are in [0, 1].
+        stated: True if the user stated the ranges, False if they were found from the samples.
     """
 
     name: str
@@ -72,28 +75,34 @@ class OwnSamples:
 
     @property
     def all(self) -> Patches:
-        """Every sample."""
+        """All samples."""
         return self._patches(self.samples)
 
     @property
     def drawn(self) -> Patches:
-        """The samples that the network is calibrated on."""
+        """The samples that the network is calibrated on: three of four."""
         return self._patches([s for k, s in enumerate(self.samples) if (k + 1) % HELD_OUT_EVERY])
 
     @property
     def for_tuning(self) -> Patches:
-        """The same samples: there are no others to train the integers on."""
+        """The samples that the integers are fine-tuned on: those of calibration, because there are
+        no others.
+        """
         return self.drawn
 
     @property
     def unseen(self) -> Patches:
-        """Every fourth sample, which calibration does not use."""
+        """The samples that are held out from calibration: every fourth one, or all if there are
+        fewer.
+        """
         # Fewer than four samples are too few to leave one out of calibration.
         return self._patches(self.samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or self.samples)
 
     @property
     def about(self) -> dict[str, str]:
-        """The metadata by which an INT8 file describes its calibration."""
+        """The metadata by which an INT8 file describes its calibration: the samples' name, digests
+        and ranges.
+        """
         digests = " ".join(map(digest_of, self.drawn.degraded))
         about = {"calibration_data": self.name, CALIBRATED_ON: digests}
         if self.ranges:
@@ -108,7 +117,11 @@ class OwnSamples:
 
 
 def digest_of(sample: np.ndarray) -> str:
-    """Return a digest that distinguishes a sample (1, C, h, w) from any other."""
+    """Return a SHA-256, cut to DIGEST_DIGITS hexadecimal digits, by which a sample is recognised.
+
+    Args:
+        sample: (1, C, h, w) as the network reads it.
+    """
     content = np.ascontiguousarray(sample, np.float32).tobytes()
     return hashlib.sha256(content).hexdigest()[:DIGEST_DIGITS]
 
@@ -116,17 +129,22 @@ def digest_of(sample: np.ndarray) -> str:
 def samples_of(
     model: onnx.ModelProto, samples: object, input_range: object = None
 ) -> OwnSamples | None:
-    """Read a user's samples for a network; return None if there are none and simulated patches suit
-    the network.
+    """Read a user's own samples for a network.
 
     Args:
         model: the network.
-        samples: a path, or an input of `samples_in`; None for simulated patches.
-        input_range: the ranges that the user states; None determines them from the samples.
+        samples: the path of a file or folder, or arrays as `samples_in` accepts them; None for
+            none.
+        input_range: the ranges of the channels that the user states, as `read_ranges` accepts them;
+            None determines them from the samples.
+
+    Returns:
+        The samples; None if the user gave none and simulated patches suit the network.
 
     Raises:
-        OptionError: no samples, and simulated patches do not suit the network; no range.
-        ImageError: samples that the network does not accept.
+        OptionError: there are no samples, and simulated patches do not suit the network; or a
+            stated range is not valid.
+        ImageError: the network does not accept the samples.
     """
     channels = int(model.graph.input[0].type.tensor_type.shape.dim[1].dim_value) or 1
     fixed_px = fixed_tile_px(model)
@@ -164,17 +182,20 @@ def read_samples(
     multiple_px: int = 1,
     ranges: Ranges | None = None,
 ) -> OwnSamples:
-    """Read the samples of a file, a folder or arrays, cut to a size that the network accepts: (1,
-    C, h, w) float32 each.
+    """Read samples from a file, a folder or arrays, and cut them to a size that the network
+    accepts.
 
     Args:
-        source: the file or folder, or the samples (C, H, W) with their references.
+        source: the file or folder, or pairs of an image (C, H, W) and its reference.
         channels: the number of channels that the network reads.
         fixed_px: side of the image that the network is fixed to; None cuts large samples to
             patches.
-        multiple_px: sides are cut to multiples of it.
+        multiple_px: sides are cut to multiples of this number of pixels.
         ranges: the ranges that the values must be in, and onto which pixels of image files are
-            mapped; None determines them.
+            mapped; None determines them from the samples.
+
+    Returns:
+        The samples, (1, C, h, w) float32 each.
 
     Raises:
         ImageError: samples that the network does not accept, or samples without any contrast.

@@ -20,10 +20,15 @@ T = TypeVar("T")
 
 
 class Regenerated(Sequence[T]):
-    """A sequence whose items are computed each time they are read: none is stored."""
+    """A sequence whose items are computed each time they are read, so that none is stored."""
 
     def __init__(self, item: Callable[[int], T], count: int) -> None:
-        """Compute item k, of `count` items, as `item(k)`."""
+        """Create the sequence.
+
+        Args:
+            item: returns an item from its place, 0 to `count` - 1.
+            count: the number of items.
+        """
         self._item = item
         self._count = count
 
@@ -42,15 +47,17 @@ class Regenerated(Sequence[T]):
 
 @dataclass(frozen=True)
 class Patches:
-    """Images (1, C, h, w) float32 as the network reads them, and their references.
+    """Images on which a network is calibrated or judged, and their references.
+
+    They are a user's own samples, or simulated patches.
 
     Attributes:
-        pairs: (degraded, reference) of each patch.
-        degraded: the same degraded patches without references, which takes half the time to
-            simulate.
-        names: the names of a user's own samples, for messages; empty for simulated patches.
-        views: the ground of each simulated patch, and its sensors; empty for a user's own samples.
-        ranges: the ranges of the channels of the images; empty if all are in [0, 1].
+        pairs: (degraded, reference) of each patch: the network's input (1, C, h, w) float32, and
+            the image that the result should be. A reference may be empty.
+        degraded: the inputs alone. Simulating them takes half the time of simulating pairs.
+        names: the name of each of a user's own samples, for messages; empty for simulated patches.
+        views: the ground and the sensors of each simulated patch; empty for a user's own samples.
+        ranges: the range (low, high) of each channel of the images; empty if all are in [0, 1].
     """
 
     pairs: Sequence[Pair]
@@ -61,7 +68,9 @@ class Patches:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of the bytes of all pairs."""
+        """The SHA-256 of the bytes of all pairs, by which files record the patches that they were
+        made with.
+        """
         digest = hashlib.sha256()
         for pair in self.pairs:
             for image in pair:

@@ -53,22 +53,27 @@ def draw_patches(
     family: SensorFamily | None = None,
     lightings: Lightings = NO_LIGHTING,
 ) -> Patches:
-    """Draw patches by sensor profile and seed, spread over the profile's ranges and over
+    """Draw patches of scenes as a sensor would acquire them, spread over its properties and over
     brightness.
 
+    The patches are simulated when they are read.
+
     Args:
-        scenes: to draw from.
-        degraded: the sensors that acquire them, unless there is a family.
-        reference: the sensor of the target images.
+        scenes: the scenes whose ground is shown.
+        degraded: the profile from whose ranges the sensor of each patch is drawn, unless there is a
+            family.
+        reference: the profile of the better sensor that acquires the target images.
         count: the number of patches.
         seed: the seed of all random draws.
-        patch_px: side of a patch.
-        family: the family of sensors with the gain and bits of `degraded`.
-        lightings: how the ground is lit, so that the patches cover the sensor's range; without any
-            it is as bright as in the scenes.
+        patch_px: side of a patch in pixels.
+        family: sensors of many blurs and noise levels to draw from instead, which have the gain and
+            bits of `degraded`.
+        lightings: the ways in which the ground is lit, each with its share of the patches, so that
+            the patches cover the sensor's range. Without any the ground is as bright as in the
+            scenes.
 
     Raises:
-        ImageError: no scene holds a patch.
+        ImageError: no scene is large enough for a patch.
         ProfileError: the two profiles differ in gain, bits or offset.
     """
     recipe = PatchRecipe(degraded, reference, patch_px=patch_px, family=family)
@@ -110,7 +115,15 @@ def _simulate(ground: Ground, sensors: Sequence[Instrument], draw: Draw) -> list
 
 @dataclass(frozen=True)
 class Calibration:
-    """The source of a run's patches."""
+    """The simulated patches of one run of the quantiser, drawn from a sensor's profile and a seed.
+
+    Attributes:
+        sensor: the profile of the sensor whose images the network restores.
+        images: the folder of scenes; None for scenes that are drawn at random.
+        patches: the number of patches that the network is calibrated on.
+        patch_px: side of these patches in pixels.
+        seed: the seed of all random draws.
+    """
 
     sensor: Sensor
     images: Path | None
@@ -125,17 +138,24 @@ class Calibration:
 
     @property
     def for_tuning(self) -> Patches:
-        """Other patches of the same scenes, for fine-tuning, which needs more of them."""
+        """The patches that the integers are fine-tuned on: TUNING_PATCHES others of the same
+        scenes.
+        """
         return self._draw(TUNING_PATCHES, self.seed + TUNING_SEED)
 
     @property
     def unseen(self) -> Patches:
-        """Patches of the same scenes, or of other drawn ones, held out from calibration."""
+        """Patches for judging the INT8 network, which calibration does not use.
+
+        They show other places of the scenes, or other scenes if these are drawn.
+        """
         return unseen_patches(self.sensor, self.images, HELD_OUT_PATCHES, self.seed)
 
     @property
     def about(self) -> dict[str, str]:
-        """The metadata by which an INT8 file describes its calibration."""
+        """The metadata by which an INT8 file describes its calibration: the sensor's name, and the
+        seed.
+        """
         return {"calibration_sensor": self.sensor.name, "calibration_seed": str(self.seed)}
 
     def _draw(self, count: int, seed: int) -> Patches:
@@ -156,11 +176,12 @@ class Calibration:
 
 
 def unseen_patches(degraded: Sensor, images: Path | None, patches: int, seed: int) -> Patches:
-    """Draw patches of 128 x 128 that calibration with the same seed does not draw.
+    """Draw patches of 128 x 128 pixels, to judge a network, that calibration with the same seed
+    does not use.
 
     Args:
         degraded: the sensor's profile; the reference is the one that belongs to it.
-        images: folder of scenes; None for drawn ones, which differ from calibration's.
+        images: the folder of scenes; None for drawn scenes, which differ from those of calibration.
         patches: the number of patches.
         seed: the seed of the calibration.
     """

@@ -24,13 +24,19 @@ REMEDY = "See docs/reference/any-network.md for how to give samples."
 
 
 def samples_in(samples: object) -> list[Pair]:
-    """Return the samples in an array, in a pair of arrays (images, references), or in an iterable
-    of these.
+    """Return the samples that a user passes in memory, as pairs of image and reference.
 
     Args:
-        samples: a batch (N, C, H, W), or one image (C, H, W), of NumPy or torch; a tuple of two; a
-            simulated pair, which has its full scale; or an iterable of any of these, such as a
-            DataLoader.
+        samples: a batch (N, C, H, W) or one image (C, H, W), of NumPy or torch; a tuple of images
+            and references, both such arrays; a simulated pair, which has its full scale; or an
+            iterable of any of these, such as a DataLoader.
+
+    Returns:
+        An image (C, H, W) and its reference for each sample. The reference is empty if there is
+        none.
+
+    Raises:
+        ImageError: arrays of other shapes, or references of another number than the images.
     """
     # A simulated pair holds digital numbers, and alone knows its full scale.
     if hasattr(samples, "degraded") and hasattr(samples, "reference"):
@@ -77,8 +83,8 @@ def _plain(array: Any) -> np.ndarray:
 
 
 def sample_files(path: Path) -> list[Path]:
-    """Return the files that samples are read from: those of a folder in their order, or the file
-    itself.
+    """Return the files that samples are read from: the arrays and images of a folder, sorted by
+    name, or the file itself.
     """
     if not path.is_dir():
         return [path]
@@ -90,12 +96,19 @@ def sample_files(path: Path) -> list[Path]:
 def stored_samples(
     source: Path | Sequence[Pair], ranges: Ranges = ()
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield the name, the image (C, H, W) and the reference of each sample.
+    """Read stored samples one after the other.
 
     Args:
-        source: a file of a batch, a folder of files of one image each, or samples in memory.
-        ranges: the ranges of the network's channels, onto which 0 to full scale of image files are
-            mapped; empty for [0, 1].
+        source: a file of a batch, a folder of files of one image each, or pairs in memory.
+        ranges: the ranges of the network's channels, onto which pixels from 0 to full scale of
+            image files are mapped; empty for [0, 1].
+
+    Yields:
+        The sample's name for messages, its image (C, H, W), and its reference, empty if there is
+        none.
+
+    Raises:
+        ImageError: a file cannot be read as samples.
     """
     if not isinstance(source, Path):
         for number, pair in enumerate(source):

@@ -54,15 +54,20 @@ JUDGING: Lightings = {
 
 @dataclass(frozen=True)
 class Ground:
-    """A square of a scene, margin included, seen at one scale and in one light.
+    """A square part of a scene that a patch shows, with a margin around it, at one scale and in one
+    light.
+
+    Scene pixels are those of the scene's own grid. Target pixels are those of the patch, each of
+    which has several scene pixels a side.
 
     Attributes:
-        scene: it lies in.
-        top: its first row in scene pixels.
-        left: its first column.
-        side_px: its rows and columns, in target pixels.
-        oversampling: scene pixels per target pixel.
-        exposure: factor on the scene's radiance.
+        scene: the scene that contains the square.
+        top: the first row of the square in scene pixels.
+        left: the first column of the square in scene pixels.
+        side_px: the side of the square in target pixels.
+        oversampling: the number of scene pixels per target pixel, along either side.
+        exposure: the factor by which the scene's radiance is multiplied, which models more or less
+            light.
     """
 
     scene: Scene
@@ -74,17 +79,19 @@ class Ground:
 
     @property
     def radiance(self) -> np.ndarray:
-        """The radiance in W/m2/sr/um on the scene's grid: a square of side_px * oversampling."""
+        """The radiance in W/m2/sr/um on the scene's grid, with side_px * oversampling pixels a
+        side.
+        """
         return self.exposure * self._part(1)
 
     @property
     def sampled_radiance(self) -> np.ndarray:
-        """One scene pixel for each target pixel, in W/m2/sr/um."""
+        """The radiance in W/m2/sr/um of one scene pixel for each target pixel."""
         return self.exposure * self._part(self.oversampling)
 
     @cached_property
     def brightness(self) -> float:
-        """Its mean radiance in W/m2/sr/um, estimated from `sampled_radiance`."""
+        """The mean radiance of the ground in W/m2/sr/um, estimated from `sampled_radiance`."""
         return float(self.sampled_radiance.mean())
 
     def _part(self, step: int) -> np.ndarray:
@@ -96,7 +103,13 @@ class Ground:
 
 @dataclass(frozen=True)
 class View:
-    """One patch: the ground, and the two sensors that see it."""
+    """The ground that a simulated patch shows, and the two sensors that acquire it.
+
+    Attributes:
+        ground: the part of a scene, with its light.
+        degraded: the sensor whose image the network restores.
+        reference: the better sensor, whose image is the target.
+    """
 
     ground: Ground
     degraded: Instrument
@@ -106,9 +119,19 @@ class View:
 def draw_views(
     scenes: Sequence[Scene], recipe: PatchRecipe, count: int, generator: np.random.Generator
 ) -> list[View]:
-    """Draw `count` views, spread over brightness, MTF and noise.
+    """Draw the ground and the sensors of patches, spread over brightness, MTF and noise.
 
-    A scene at a scale is drawn as often as it holds patches, as training sees it.
+    The chance of a scene at a scale is proportional to the number of patches that it holds, as in
+    training.
+
+    Args:
+        scenes: the scenes to draw from.
+        recipe: the size of the patches, and the sensors, scales and light to draw from.
+        count: the number of views.
+        generator: the generator of all draws.
+
+    Raises:
+        ImageError: no scene is large enough for a patch.
     """
     places = _places(scenes, recipe)
     sides = [
@@ -149,11 +172,13 @@ def stratified(
     count: int,
     generator: np.random.Generator,
 ) -> list[Candidate]:
-    """Divide the candidates, sorted by `key`, into equal groups, and draw one of each.
+    """Draw candidates such that they spread over a property: one from each of equally large groups.
+
+    The groups are consecutive parts of the candidates sorted by the property.
 
     Args:
-        candidates: at least `count` of them.
-        key: by which they are sorted.
+        candidates: at least `count` items.
+        key: returns the property by which the candidates are sorted.
         count: the number of groups.
         generator: the generator of the draws.
 
@@ -200,12 +225,16 @@ def _ground(
 def relit(
     views: Sequence[View], lightings: Lightings, generator: np.random.Generator
 ) -> list[View]:
-    """Return the views with other light: each share of them is lit as `lightings` states.
+    """Multiply the light on the ground of some views, so that a stated share of them is bright,
+    dark or saturated.
 
     Args:
-        views: the ground of each is multiplied by a factor.
-        lightings: the share of the views for each kind of light.
+        views: the views.
+        lightings: the share of the views for each way of lighting, by its name as in `JUDGING`.
         generator: draws which views get which light, and the factors.
+
+    Returns:
+        The views with other exposures, in the same order.
     """
     assigned = assign_lightings(len(views), lightings, generator)
     result = []
@@ -219,7 +248,17 @@ def relit(
 
 
 def assign_lightings(count: int, lightings: Lightings, generator: np.random.Generator) -> list[str]:
-    """Assign a lighting to each of `count` patches at random, each in its share of the patches."""
+    """Assign a way of lighting to each patch at random, such that each way gets its share of the
+    patches.
+
+    Args:
+        count: the number of patches.
+        lightings: the share of each way, by its name. The shares add up to 1.
+        generator: draws the order.
+
+    Returns:
+        The name of the lighting of each patch.
+    """
     names = list(lightings)
     # Each patch stands for the middle of an equal part of [0, 1], which rounds the shares to whole
     # patches.
@@ -231,13 +270,16 @@ def assign_lightings(count: int, lightings: Lightings, generator: np.random.Gene
 def light_factor(
     lighting: str, radiance: np.ndarray, full_scale: float, generator: np.random.Generator
 ) -> float:
-    """Return the factor on the radiance (h, w) that lights ground in one of the ways of `JUDGING`.
+    """Draw the factor by which ground is brightened or darkened for one way of lighting.
 
     Args:
-        lighting: the way.
-        radiance: the radiance of the ground, in W/m2/sr/um.
-        full_scale: the radiance that the sensor's largest digital number stands for.
-        generator: the generator of the random part.
+        lighting: the way, a key of `JUDGING`.
+        radiance: (h, w) the radiance of the ground, in W/m2/sr/um.
+        full_scale: the radiance at which the sensor saturates, in W/m2/sr/um.
+        generator: draws the random part.
+
+    Returns:
+        The factor on the radiance; 1 for ground without any light.
     """
     if lighting == "as drawn":
         return 1.0

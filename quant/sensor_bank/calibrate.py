@@ -116,9 +116,14 @@ def _analytic(scale: int, result: int, shifts: Shifts, decoding: BankSum, inputs
 
 
 def body_graph(weights: Weights) -> Graph:
-    """Return the float graph behind a bank, which computes the correction in units.
+    """Return the float operations behind a sensor's filter bank, which compute the correction of
+    the image.
 
-    It reads the bank's results and four planes of a sensor's values.
+    They read the results of the bank's filters, and four planes that hold the values of the sensor
+    vector. The correction is in the bank's unit (`Bank.unit`).
+
+    Args:
+        weights: the trained weights of a `BankedConvBEERS`.
     """
     variant = weights.variant
     tensors = weights.tensors
@@ -167,11 +172,14 @@ def _head(weights: Weights) -> Conv:
 
 
 def bank_host_part(scale: int, decoding: BankSum) -> HostPart:
-    """Return the pre- and post-processing of a network that reads the planes of a filter bank.
+    """Return the host's pre- and post-processing for a network whose first layer is a sensor's
+    filter bank.
 
     Args:
-        scale: side of the square of pixels that is one place of the network's maps.
-        decoding: how the host merges the copies of the correction and of the analytic restoration.
+        scale: the side in pixels of the square of the image that is one pixel of the network's
+            maps.
+        decoding: how the host combines the copies of the correction and of the analytic
+            restoration.
     """
     pixels = scale**2
     back = (Shuffle("shuffle", "", "", scale, True, False),) if scale > 1 else ()
@@ -182,17 +190,21 @@ def bank_host_part(scale: int, decoding: BankSum) -> HostPart:
 def bank_results(
     image: np.ndarray, bank: Bank, vector: Sequence[float], scale: int, kernels: Kernels = "fitted"
 ) -> np.ndarray:
-    """Compute the input of the body for an image (1, 1, H, W) in [0, 1]: (1, C, H / S, W / S)
-    float32.
-
-    These are the bank's results / 128 at a gain of 1, and planes of half of a sensor's values.
+    """Compute what the layers behind a sensor's filter bank read for an image.
 
     Args:
-        image: the image.
-        bank: the bank of the sensor.
-        vector: the sensor vector (4,).
-        scale: S of the network.
-        kernels: the kernels of the bank.
+        image: (1, 1, H, W) in [0, 1].
+        bank: the filters of the sensor.
+        vector: (4,) the sensor vector: MTF across and along the track and noise at two
+            brightnesses, each scaled to [-1, 1].
+        scale: S, the side in pixels of the square of the image that is one pixel of the network's
+            maps.
+        kernels: how the filters got 7 x 7 weights: "fitted" to that size, or "cut" in older
+            networks.
+
+    Returns:
+        (1, C, H / S, W / S) float32: the int8 results of the filters divided by 128, at a gain of
+        1, then four planes of half of each value of the sensor vector.
     """
     integers = integer_bank(bank, scale, 1, kernels)
     planes = bank_host_part(scale, BankSum()).encode(image)
@@ -214,15 +226,19 @@ def quantize_behind_bank(
     passes: Passes = ALL,
     effort: Effort = Effort.normal,
 ) -> ConditionedCore:
-    """Quantise a network behind a bank; its core is for the middle of the range of sensors.
+    """Quantise the layers behind a sensor's filter bank once for all sensors.
 
     Args:
-        weights: the weights of a `BankedConvBEERS`.
-        bank: the bank of the middle of the range.
-        images: the images of `bank_results`, of sensors from the whole range.
-        shifts: the windows of the target.
+        weights: the trained weights of a `BankedConvBEERS`.
+        bank: the filters of the sensor in the middle of the range.
+        images: calibration inputs of these layers, as `bank_images` returns them.
+        shifts: the smallest and largest shifts that the target allows.
         passes: the passes that reduce the error.
         effort: the effort of the search for equalization factors.
+
+    Returns:
+        The core for the sensor in the middle of the range, and the biases from which it is
+        conditioned on any other sensor.
     """
     body, _ = rounded(_plan(weights, shifts, passes, effort), images)
     biases = {op.name: _biases(op) for op in body.convolutions}
@@ -239,12 +255,19 @@ def quantize_behind_bank(
 
 
 def map_steps(conditioned: ConditionedCore, weights: Weights) -> list[np.ndarray]:
-    """Compute the float value of one integer step of each feature map, at a gain of 1.
+    """Compute the float value that one integer step of each feature map stands for, at a gain of 1.
 
-    Equalization multiplied each channel by a factor: the ratio of integer weights to float ones.
+    Training uses the steps to round maps as INT8 does. A step of a channel is the scale of the map
+    over the factor by which equalization multiplied the channel, which is the ratio of integer
+    weights to float ones.
+
+    Args:
+        conditioned: the quantised network.
+        weights: the float weights that it was quantised from.
 
     Returns:
-        (F,) of the maps between head and tail, then of the one within each block.
+        Arrays (F,), one value per feature: first for the maps between head and tail, which share
+        one, then for the map within each block.
     """
     core = conditioned.core
     quantized = {op.name: op.weight * 2.0**-op.weight_frac_bits for op in core.convolutions}
@@ -297,14 +320,20 @@ SNR = (90.0, 165.0)
 def bank_images(
     scenes: list[Scene], scale: int, seed: int, kernels: Kernels
 ) -> Sequence[np.ndarray]:
-    """Return the calibration images of a network behind a bank: scenes acquired by many sensors,
-    after the bank of each.
+    """Return calibration inputs of the layers behind a filter bank, from patches of many sensors.
+
+    Each patch is acquired by another sensor, and filtered by the bank of that sensor.
 
     Args:
-        scenes: to simulate images of.
-        scale: the scale of the network.
+        scenes: the scenes that the patches show.
+        scale: the side in pixels of the square of the image that is one pixel of the network's
+            maps.
         seed: the seed of all random draws.
-        kernels: the kernels of the banks.
+        kernels: how the filters got 7 x 7 weights: "fitted" to that size, or "cut" in older
+            networks.
+
+    Returns:
+        Arrays as `bank_results` returns them, which are computed each time they are read.
     """
     like = Sensor.load(LIKE)
     reference = Sensor.load(REFERENCE)

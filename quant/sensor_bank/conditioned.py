@@ -41,14 +41,18 @@ BANK = "bank"
 
 @dataclass(frozen=True)
 class ConditionedCore:
-    """The core of a network behind a bank, and the data to condition it on another sensor.
+    """The integer core of a network behind a sensor's filter bank, and what is needed to condition
+    it on another sensor.
+
+    A gain is the factor by which a sensor's quantisation steps are finer than at a reference noise
+    (`Bank.gain`).
 
     Attributes:
-        core: for the middle of the range of sensors, or for the sensor of its file.
-        biases: the biases of the convolutions behind the bank, by name, at a gain of 1: (O, 1). For
-            those that read the bank (O, 5): the bias for the middle of the range, and the addition
-            per value of a sensor vector.
-        shifts: the windows of the target.
+        core: the core for the middle of the range of sensors, or for the sensor of its file.
+        biases: the real biases, at a gain of 1, of the convolutions behind the bank by their names:
+            (O, 1). For the convolution that reads the bank (O, 5): its bias for the middle of the
+            range, and what is added per value of a sensor vector.
+        shifts: the smallest and largest shifts that the target allows.
     """
 
     core: IntCore
@@ -57,12 +61,20 @@ class ConditionedCore:
 
     @property
     def kernels(self) -> Kernels:
-        """The kind of the bank's kernels."""
+        """The kind of the bank's kernels: "fitted", or "cut" for networks trained before kernels
+        were fitted.
+        """
         # Only behind fitted kernels does the analytic restoration have a coarse copy.
         return "fitted" if self.core.host_part.decoding == BankSum(coarse_copies=1) else "cut"
 
     def for_sensor(self, bank: Bank, vector: Sequence[float]) -> IntCore:
-        """Return the core for one sensor, from its bank and its sensor vector (4,)."""
+        """Return the core for one sensor, with its filters, biases and unit.
+
+        Args:
+            bank: the filters of the sensor.
+            vector: (4,) the sensor vector: MTF across and along the track and noise at two
+                brightnesses, each scaled to [-1, 1].
+        """
         gain = bank.gain
         # ReLU and sums pass a positive factor on, so of the body only biases grow.
         values = gain * np.array([1.0, *vector])
@@ -85,15 +97,22 @@ class ConditionedCore:
         return replace(op, bias=bias, bias_frac_bits=bits)
 
     def biases_to_json(self) -> str:
-        """Return the biases as JSON, for the metadata of a file."""
+        """Return the biases by layer name as JSON, for the metadata of an INT8 file."""
         return json.dumps({name: values.tolist() for name, values in self.biases.items()})
 
 
 def conditioned_core(model: onnx.ModelProto) -> ConditionedCore | None:
-    """Read the conditioned core of an INT8 file; None if the file has none.
+    """Read an INT8 file's core together with the biases by which it is conditioned on other
+    sensors.
+
+    Args:
+        model: an INT8 network.
+
+    Returns:
+        The core and the biases; None if the network's first layer is no filter bank of a sensor.
 
     Raises:
-        ModelError: a damaged file.
+        ModelError: the file is damaged.
     """
     text = metadata(model).get(SENSOR_BIASES)
     if text is None:
@@ -114,7 +133,15 @@ def conditioned_core(model: onnx.ModelProto) -> ConditionedCore | None:
 
 
 def required_conditioned_core(model: onnx.ModelProto) -> ConditionedCore:
-    """Read the conditioned core of an INT8 file, or raise ModelError if the file has none."""
+    """Read an INT8 file's core together with the biases by which it is conditioned on other
+    sensors.
+
+    Args:
+        model: an INT8 network.
+
+    Raises:
+        ModelError: the file is damaged, or cannot be conditioned on a sensor.
+    """
     conditioned = conditioned_core(model)
     if conditioned is None:
         raise ModelError(
@@ -125,7 +152,16 @@ def required_conditioned_core(model: onnx.ModelProto) -> ConditionedCore:
 
 
 def bank_layer(bank: Bank, scale: int, shifts: Shifts, kernels: Kernels) -> IntConv:
-    """Return the first convolution of a network of the given scale, for one sensor."""
+    """Return the first convolution of an integer core: the filter bank of one sensor.
+
+    Args:
+        bank: the filters of the sensor.
+        scale: the side in pixels of the square of the image that is one pixel of the network's
+            maps.
+        shifts: the smallest and largest shifts that the target allows.
+        kernels: how the filters got 7 x 7 weights: "fitted" to that size, or "cut" in older
+            networks.
+    """
     integers = integer_bank(bank, scale, bank.gain, kernels)
     # The offsets put each copy of a result at another place of a rounding step.
     bias = quantize_bias(integers.offsets * 2.0**-BITS, integers.frac_bits + BITS, shifts)
@@ -133,9 +169,16 @@ def bank_layer(bank: Bank, scale: int, shifts: Shifts, kernels: Kernels) -> IntC
 
 
 def delta_of_file(model: onnx.ModelProto) -> bytes:
-    """Return the data in an INT8 file that depend on its sensor, for `with_delta`.
+    """Return the part of an INT8 file that depends on its sensor, called the delta.
 
+    A satellite that has the network of one sensor needs only the delta of another (`with_delta`).
     It is a line of JSON and the int8 numbers of each convolution that the line names, compressed.
+
+    Args:
+        model: an INT8 network that was conditioned on a sensor.
+
+    Raises:
+        ModelError: the file is damaged, or cannot be conditioned on a sensor.
     """
     conditioned = required_conditioned_core(model)
     core = conditioned.core
@@ -155,15 +198,18 @@ def delta_of_file(model: onnx.ModelProto) -> bytes:
 
 
 def with_delta(core: IntCore, delta: bytes, where: str = "The delta") -> tuple[IntCore, str]:
-    """Return a core conditioned on the sensor of a delta, and that sensor's name.
+    """Replace the part of a core that depends on its sensor by that of another sensor.
 
     Args:
-        core: the core of the network that the delta was made for.
-        delta: its bytes.
-        where: its name at the beginning of messages.
+        core: the core of the network that the delta belongs to, for any sensor.
+        delta: the bytes that `delta_of_file` returned for the other sensor's file.
+        where: the name of the delta at the beginning of messages.
+
+    Returns:
+        The core for the other sensor, and that sensor's name.
 
     Raises:
-        ModelError: damaged bytes, or a delta of another network.
+        ModelError: the bytes are damaged, or belong to another network.
     """
     try:
         # The limit keeps a small delta from being unpacked to any size.

@@ -55,13 +55,14 @@ REACH_PX = 30.0
 
 @dataclass(frozen=True)
 class IntegerBank:
-    """The first convolution in integers.
+    """The filters of one sensor as an integer convolution, the first of an INT8 network.
 
     Attributes:
-        weight: (O, 4 S^2, k, k) int8 for the planes of an image. All channels of one plane are
-            consecutive.
-        frac_bits: the right shift that converts a sum of products to int8.
-        offsets: (O,) offset of each output channel before rounding, in quantisation steps.
+        weight: (O, 4 S^2, k, k) int8, which read the four planes of an image with S^2 channels. All
+            channels of one plane are consecutive.
+        frac_bits: the right shift in bits that makes int8 results of the sums of products.
+        offsets: (O,) the offset of each output channel that is added before rounding, in
+            quantisation steps.
     """
 
     weight: NDArray[np.int8]
@@ -70,23 +71,25 @@ class IntegerBank:
 
 
 def coarse_copies(kernels: Kernels) -> int:
-    """Return the number of copies of the analytic restoration with steps that are coarser by
-    `WIDE`.
+    """Return the number of copies of the analytic restoration that are coarser by `WIDE`: 1 or 0.
 
-    With fitted kernels the last copy is coarse, for values at which the others are clipped.
+    The analytic restoration is the one that the filters compute without the network. With "fitted"
+    kernels its last copy is coarse, for values at which the others are clipped; with "cut" kernels
+    none is.
     """
     return int(kernels == "fitted")
 
 
 def channels(kernels: Kernels = "fitted") -> list[tuple[int, float]]:
-    """Return which filter each output channel of the bank computes, and how it is rounded.
+    """Return which filter each output channel of the integer bank computes, and how it is rounded.
 
     Args:
-        kernels: "fitted" adds a coarse copy of the analytic restoration.
+        kernels: the kind of the bank's kernels. "fitted" makes one copy of the analytic restoration
+            coarse, "cut" none.
 
     Returns:
-        For each channel of one pixel: the index of its kernel, and the offset that is added before
-        rounding, in quantisation steps. Copies of a kernel have different offsets.
+        For each channel of one pixel: the number of its filter, and the offset that is added before
+        rounding, in quantisation steps. Copies of a filter have different offsets.
     """
     coarse = coarse_copies(kernels)
     copies = [COPIES[0], *[COPIES[1]] * FILTERS, COPIES[2] - coarse, coarse]
@@ -106,13 +109,16 @@ def spread_over_a_step(count: int) -> list[float]:
 
 
 def integer_bank(bank: Bank, scale: int, gain: float, kernels: Kernels = "fitted") -> IntegerBank:
-    """Quantise a bank for a network.
+    """Round the filters of a sensor to an integer convolution.
 
     Args:
-        bank: the bank of the sensor.
-        scale: the scale of the network.
-        gain: the factor by which the steps of the results are finer.
-        kernels: the kernels of the bank.
+        bank: the filters of the sensor.
+        scale: S, the side in pixels of the square of the image that is one pixel of the network's
+            maps.
+        gain: the factor by which the quantisation steps of the results are finer than at a
+            reference noise (`Bank.gain`).
+        kernels: how the filters got 7 x 7 weights: "fitted" to that size, or "cut" in older
+            networks.
     """
     steps = np.concatenate([bank.kernels, bank.kernels[-1:] / WIDE])
     # The kernels multiply shares of full scale, but the planes hold digital numbers.
@@ -167,11 +173,16 @@ def _of_filter(kernel: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def shaped(values: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Round values (49,) to integers of sum 0 whose errors natural images hardly show.
+    """Round the weights of a filter to integers of sum 0, with errors that natural images hardly
+    show.
 
-    The error is e^T C e, with C the covariance of natural images. From the nearest integers, made
-    to sum to 0, one is raised and another lowered as long as that lowers the error. All sums are
-    exact, so that every processor finds the same integers.
+    The squared error of a result is e^T C e, with e the rounding errors and C the covariance of
+    natural images. From the nearest integers, made to sum to 0, one is raised and another lowered
+    as long as that lowers the error. All sums are exact, so that every processor finds the same
+    integers.
+
+    Args:
+        values: (49,) the real weights of a 7 x 7 filter.
     """
     exact = _on_grid(values)
     weight = np.rint(exact)

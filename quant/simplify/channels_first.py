@@ -14,10 +14,13 @@ TO_LAST = [0, 2, 3, 1]
 
 
 def channels_first(model: onnx.ModelProto) -> None:
-    """Put the channels of image and result first, in place, if the image is transposed so.
+    """Convert a network whose image has its channels last, and its result as well, to channels
+    first.
+
+    A network that does not transpose its image to channels first in its first nodes is unchanged.
 
     Args:
-        model: a float network.
+        model: a float network, which is changed in place.
     """
     graph = OnnxGraph(model)
     images = [name for name in graph.inputs if _is_transposed(graph.readers[name], TO_FIRST)]

@@ -12,16 +12,17 @@ from beers_deploy.quant.simplify.standard_operators import Shapes, slices_of
 
 
 def convolve_crop(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Return the depthwise convolution that a Slice of rows and columns is.
+    """Replace a Slice that cuts a border off a map by a depthwise convolution that has the same
+    result.
 
     Args:
-        shapes: the shapes of each float tensor.
+        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
         graph: the graph that the node belongs to; its constants are extended.
         node: any node.
 
     Returns:
-        The convolution, None for a Slice that does not cut as much at either side, and for any
-        other node.
+        The convolution. None for a Slice that does not cut the same number of pixels at either
+        side, and for any other node.
     """
     size = shapes.get(node.inputs[0], ()) if node.op_type == "Slice" else ()
     if len(size) != 4 or size[1] < 1:

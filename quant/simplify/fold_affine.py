@@ -23,19 +23,33 @@ NORMALISATION = "BatchNormalization"
 
 @dataclass(frozen=True)
 class Affine:
-    """scale * x + shift, each (C,) float64, or (1,) for all channels."""
+    """The function scale * x + shift of each channel of a map.
+
+    Attributes:
+        scale: (C,) float64, or (1,) for all channels.
+        shift: (C,) float64, or (1,) for all channels.
+    """
 
     scale: np.ndarray
     shift: np.ndarray
 
     @property
     def channels(self) -> int:
-        """The number of channels; 1 if the numbers apply to all channels."""
+        """The number of channels; 1 if scale and shift apply to all channels."""
         return max(len(self.scale), len(self.shift))
 
 
 def add_negated(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Negate the convolution that computes the subtrahend, and add its result (1)."""
+    """Replace a - b by a + (-b), where the convolution that computes b is negated (point 1 of the
+    module).
+
+    Args:
+        graph: the graph that the node belongs to; the convolution gets other weights.
+        node: any node.
+
+    Returns:
+        The Add; None if the node is no Sub of a convolution's result that nothing else reads.
+    """
     if node.op_type != "Sub" or node.inputs[0] in graph.constants:
         return None
     before = graph.sole_writer(node.inputs[1])
@@ -46,15 +60,16 @@ def add_negated(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
 
 def negate_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Negate the subtrahend by a convolution of its own, and add the result (1).
+    """Replace a - b by a + (-b), where a new convolution of one pixel negates b (point 1 of the
+    module).
 
     Args:
-        shapes: the shapes of each float tensor.
+        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
         graph: the graph that the node belongs to; its constants are extended.
         node: any node.
 
     Returns:
-        The convolution and the Add, None if the node is no Sub of two maps of known channels.
+        The convolution and the Add; None if the node is no Sub of two maps of known channels.
     """
     channels = channels_in(shapes, node.inputs[1]) if node.op_type == "Sub" else 0
     if not channels or not graph.constants.keys().isdisjoint(node.inputs):
@@ -66,7 +81,17 @@ def negate_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[
 
 
 def fold_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Fold an operation per channel into the convolution that it follows (2)."""
+    """Fold a node that scales and shifts channels into the convolution in front of it (point 2 of
+    the module).
+
+    Args:
+        graph: the graph that the node belongs to; the convolution gets other weights.
+        node: any node.
+
+    Returns:
+        An empty list, because the convolution then computes the node's result. None if the node
+        does something else, or if it follows no convolution whose result only it reads.
+    """
     match = affine_of(graph, node)
     if match is None:
         return None
@@ -82,7 +107,13 @@ def fold_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
 
 def fold_in_front(graph: OnnxGraph, shapes: Shapes) -> None:
-    """Fold an operation per channel into the convolutions that read it (3)."""
+    """Fold nodes that scale and shift channels into the convolutions behind them, where that is
+    exact (point 3 of the module).
+
+    Args:
+        graph: the graph, which is changed in place.
+        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
+    """
     folded = set[Node]()
     for node in graph.nodes[::-1]:
         result = node.outputs[0]
@@ -106,7 +137,18 @@ def fold_in_front(graph: OnnxGraph, shapes: Shapes) -> None:
 
 
 def convolve_normalisation(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a remaining normalisation of images by a depthwise convolution (4)."""
+    """Replace a BatchNormalization that could not be folded by a depthwise convolution (point 4 of
+    the module).
+
+    Args:
+        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
+        graph: the graph that the node belongs to; its constants are extended.
+        node: any node.
+
+    Returns:
+        The convolution, or an empty list if the node can now be folded into the convolution in
+        front of it. None if the node stays.
+    """
     # The normalisation in front may just have become a convolution, which takes this one in.
     replacement = fold_behind(graph, node)
     match = affine_of(graph, node) if node.op_type == NORMALISATION else None
@@ -120,9 +162,18 @@ def convolve_normalisation(shapes: Shapes, graph: OnnxGraph, node: Node) -> list
 
 
 def affine_of(graph: OnnxGraph, node: Node) -> tuple[str, Affine] | None:
-    """Return the input tensor of a node and its scale and shift of each channel.
+    """Return the scale and shift of a node that multiplies channels by constants, and adds
+    constants.
 
-    None if the node does something else.
+    That is a BatchNormalization, or an Add, Sub, Mul or Div by one constant per channel.
+
+    Args:
+        graph: the graph that the node belongs to.
+        node: any node.
+
+    Returns:
+        The name of the tensor that is scaled, and scale and shift; None if the node does something
+        else.
     """
     if node.op_type == NORMALISATION:
         return _normalisation(graph, node)
@@ -162,9 +213,13 @@ def _normalisation(graph: OnnxGraph, node: Node) -> tuple[str, Affine] | None:
 
 
 def per_channel(value: np.ndarray | None) -> np.ndarray | None:
-    """Return (C,) or (1,) of a constant that is one number per channel of (N, C, H, W).
+    """Return a constant as one number per channel, if it has that effect on a map (N, C, H, W).
 
-    None for any other.
+    Args:
+        value: a constant that is combined with a map, or None.
+
+    Returns:
+        (C,), or (1,) for all channels; None for any other constant.
     """
     if value is None or value.ndim > 4:
         return None
@@ -179,7 +234,7 @@ def _float64(graph: OnnxGraph, node: Node, place: int) -> np.ndarray | None:
 
 
 def is_convolution(graph: OnnxGraph, node: Node) -> bool:
-    """Return True for a convolution of images, transposed or not, of constant weights and bias."""
+    """Return True if a node is a convolution, transposed or not, with constant weights and bias."""
     if node.op_type not in ("Conv", "ConvTranspose"):
         return False
     numbers = [graph.constants.get(name) for name in node.inputs[1:] if name]

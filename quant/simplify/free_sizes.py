@@ -36,11 +36,16 @@ Fold = Callable[[onnx.ModelProto], onnx.ModelProto]
 
 
 def free_sizes(model: onnx.ModelProto, fold: Fold) -> onnx.ModelProto:
-    """Return the network without arithmetic on sizes; unchanged if the size has an effect.
+    """Return the network without arithmetic on the size of its image, if the size has no effect on
+    the rest.
 
     Args:
         model: a float network of this project's opset; not changed.
-        fold: folds the constants of a network.
+        fold: a function that folds the constants of a network, as onnxruntime does.
+
+    Returns:
+        The network for images whose sides are multiples of MULTIPLE_PX; `model` itself if the size
+        has an effect.
     """
     constants = {tensor.name for tensor in model.graph.initializer}
     if not any(

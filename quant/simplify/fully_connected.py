@@ -22,14 +22,20 @@ Map = tuple[int, int, int]
 
 
 class ConnectByConvolutions:
-    """A pass for `OnnxGraph.rewrite` that remembers which tensors are flat maps."""
+    """A pass that turns fully connected layers into convolutions; an instance is given to
+    `OnnxGraph.rewrite`.
+
+    It remembers which tensors are flattened maps, and the maps that they were made from.
+    """
 
     def __init__(self, shapes: Shapes) -> None:
         self._shapes = shapes
         self._maps: dict[str, tuple[str, Map]] = {}
 
     def __call__(self, graph: OnnxGraph, node: Node) -> list[Node] | None:
-        """Return the nodes that replace a node, None if it stays."""
+        """Return the nodes that replace a node, an empty list if it is not needed, and None if it
+        stays.
+        """
         name = node.inputs[0] if node.inputs else ""
         if self._flattens(graph, node):
             channels, height, width = self._shapes[name][1:]

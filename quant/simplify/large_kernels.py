@@ -22,19 +22,25 @@ LARGE_POSITIONS = 64
 
 
 def is_large(shape: tuple[int, ...]) -> bool:
-    """Return True for weights (O, I, kh, kw) that are split."""
+    """Return True if a kernel has more than LARGE_POSITIONS positions, height times width, and is
+    split.
+
+    Args:
+        shape: (O, I, kh, kw) the sizes of the weights.
+    """
     return len(shape) == 4 and shape[2] * shape[3] > LARGE_POSITIONS
 
 
 def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Return the parts of a convolution with a large kernel, and their sum.
+    """Replace a convolution of a large kernel by several of smaller ones, and the sum of their
+    results.
 
     Args:
         graph: the graph that the node belongs to; its constants are extended.
         node: any node.
 
     Returns:
-        A convolution for each part, their Concat and the convolution that sums them; None if the
+        A convolution for each part, their Concat, and the convolution that sums them; None if the
         node is no convolution that is split.
     """
     if node.op_type != "Conv" or not is_convolution(graph, node):

@@ -27,13 +27,14 @@ MOST_PX = 128
 
 
 def with_missing_border(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Return a network whose result lacks no border.
+    """Return a network whose result has the size of its image, by mirroring the image beyond its
+    borders first.
 
     Args:
         model: a float network without needless nodes; not changed.
 
     Returns:
-        The network with a Pad in front, the given one if no border is missing.
+        The network with a Pad in front; `model` itself if no border is missing.
     """
     nodes = model.graph.node
     windows = [node for node in nodes if node.op_type in WINDOWS]

@@ -100,11 +100,17 @@ HALVES = (TensorProto.FLOAT16, TensorProto.BFLOAT16)
 
 
 def simplify(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
-    """Simplify a float network as described in the module.
+    """Rewrite a float network as exporters write it to the form that the rest of this project
+    reads.
+
+    Its function does not change. The description of the module lists what holds afterwards.
 
     Args:
-        model: accepted by `check_content` and `check_runnable`; not changed.
+        model: a model that `check_content` and `check_runnable` accepted; not changed.
         where: name of the network for messages, such as "a.onnx".
+
+    Returns:
+        The network; `model` itself if nothing has to be changed.
     """
     with contradictions(where):
         network = model if _is_plain(model) else _simplified(model, where)

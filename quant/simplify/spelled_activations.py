@@ -21,14 +21,14 @@ SLOPE_AND_OFFSET = {"alpha": 1 / 6, "beta": 0.5}
 
 
 def join_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a Clip or a Max that is a ReLU (1).
+    """Replace a Clip or a Max that computes a ReLU by Relu (point 1 of the module).
 
     Args:
         graph: the graph that the node belongs to.
         node: any node.
 
     Returns:
-        The ReLU, None if the node is something else.
+        The Relu; None if the node is something else.
     """
     source = None
     if node.op_type == "Clip":
@@ -45,14 +45,16 @@ def join_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
 
 def join_hard_swish(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a node that completes a HardSwish, or a HardSigmoid, by that operator (2).
+    """Replace nodes that together compute a HardSwish or a HardSigmoid by that operator (point 2 of
+    the module).
 
     Args:
         graph: the graph that the node belongs to.
-        node: any node; nodes in front of it are removed if nothing else reads them.
+        node: any node; only the last of such nodes is replaced. Those in front of it are removed
+            later if nothing else reads them.
 
     Returns:
-        The activation, None if the node completes none.
+        The activation; None if the node completes none.
     """
     result = node.outputs[0]
     clipped = _sixth_of(graph, node) or ""
@@ -67,14 +69,15 @@ def join_hard_swish(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
 
 def halve_before_gelu(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Move the half of a GELU in front of its product (3).
+    """Move the factor 1/2 of a GELU, x (1 + Erf(x / sqrt(2))) / 2, in front of the product (point 3
+    of the module).
 
     Args:
         graph: the graph that the node belongs to.
-        node: any node.
+        node: any node; only the multiplication by 1/2 is replaced.
 
     Returns:
-        The half, and the product that completes the GELU; None if the node halves no such product.
+        x / 2, and the product that completes the GELU; None if the node stays.
     """
     product = graph.sole_writer(other_operand(graph, node, "Mul", 0.5) or "")
     if product is None or product.op_type != "Mul":
@@ -92,7 +95,13 @@ def halve_before_gelu(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
 
 def gelu_gate_input(graph: OnnxGraph, name: str) -> str | None:
-    """Return x if a tensor is 1 + Erf(x / sqrt(2))."""
+    """Return the name of x if a tensor is 1 + Erf(x / sqrt(2)), the factor of x in a GELU; else
+    None.
+
+    Args:
+        graph: the graph that the tensor belongs to.
+        name: the name of the tensor.
+    """
     erf = graph.writers.get(other_operand(graph, graph.writers.get(name), "Add", 1) or "")
     if erf is None or erf.op_type != "Erf":
         return None
@@ -141,13 +150,15 @@ def _shifted_and_clipped(graph: OnnxGraph, name: str) -> str | None:
 
 
 def other_operand(graph: OnnxGraph, node: Node | None, kind: str, number: float) -> str | None:
-    """Return the tensor that a node of this operator combines with a constant number.
+    """Return the name of the tensor that a node combines with a given constant number; None if it
+    does not.
 
     Args:
         graph: the graph that the node belongs to.
         node: any node; None returns None.
-        kind: an operator of two operands, in any order but for Div, whose constant divides.
-        number: the constant, up to the rounding of float32.
+        kind: the operator that the node must have, with two operands. The constant may be either of
+            them, but for Div it must be the divisor.
+        number: the constant, which is compared up to the rounding of float32.
     """
     if node is not None and node.op_type == kind and len(node.inputs) == 2:
         for place in (0, 1)[: 1 if kind == "Div" else 2]:

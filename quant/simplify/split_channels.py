@@ -22,15 +22,16 @@ Part = tuple[str, np.ndarray]
 
 
 def split_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Return operations that compute the parts of a map (1).
+    """Replace a Split, or a Slice of channels, by operations that compute each part by itself
+    (point 1 of the module).
 
     Args:
-        shapes: the shapes of each float tensor.
+        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
         graph: the graph that the node belongs to; its constants are extended.
         node: any node.
 
     Returns:
-        The operations that replace the node, None if it does not split.
+        The operations that replace the node; None if it does not split channels.
     """
     parts = _parts(graph, node, shapes)
     source = node.inputs[0] if parts else ""

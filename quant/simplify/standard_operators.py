@@ -8,7 +8,11 @@ Shapes = dict[str, tuple[int, ...]]
 
 
 def float_shapes(graph: OnnxGraph) -> Shapes:
-    """Infer the sizes of each float32 tensor whose rank is known, 0 for a size that is not."""
+    """Infer the sizes of each float32 tensor of a graph.
+
+    Returns:
+        The sizes by tensor name, 0 for an unknown size. Tensors of unknown rank are left out.
+    """
     return {
         name: sizes_of(tensor)
         for name, tensor in graph.tensor_types().items()
@@ -17,14 +21,26 @@ def float_shapes(graph: OnnxGraph) -> Shapes:
 
 
 def channels_in(shapes: Shapes, name: str) -> int:
-    """Return the number of channels of a map (N, C, H, W); 0 if it is not known."""
+    """Return the number of channels of a map (N, C, H, W); 0 if it is not known.
+
+    Args:
+        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
+        name: the name of the map.
+    """
     sizes = shapes.get(name, ())
     return sizes[1] if len(sizes) == 4 else 0
 
 
 def slices_of(graph: OnnxGraph, node: Node) -> dict[int, slice]:
-    """Return what a Slice of a tensor of four axes cuts, by axis; empty if other nodes compute
-    it.
+    """Return which part of each axis a Slice of a tensor of four axes selects.
+
+    Args:
+        graph: the graph that the node belongs to.
+        node: a Slice.
+
+    Returns:
+        The slice of each axis that is cut, by the axis' number from 0 to 3; empty if other nodes
+        compute the positions.
     """
     starts, stops, axes, steps = (graph.numbers(node, place, "") for place in range(1, 5))
     if not (starts and stops and axes) or steps is None:
@@ -35,7 +51,14 @@ def slices_of(graph: OnnxGraph, node: Node) -> dict[int, slice]:
 
 
 def split_sums(_: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a Sum of several tensors by Adds, one after the other."""
+    """Replace a Sum of several tensors by Adds of two, one after the other.
+
+    Args:
+        node: any node.
+
+    Returns:
+        The Adds; None if the node is no Sum of several tensors.
+    """
     if node.op_type != "Sum" or len(node.inputs) < 2:
         return None
     subtotal = node.inputs[0]
@@ -53,7 +76,15 @@ def split_sums(_: OnnxGraph, node: Node) -> list[Node] | None:
 def drop_cast(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Remove a Cast to float32 of a tensor that is float32 already.
 
-    The runtime leaves such a Cast if it writes a result.
+    onnxruntime leaves such a Cast if it writes a result.
+
+    Args:
+        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
+        graph: the graph that the node belongs to.
+        node: any node.
+
+    Returns:
+        An empty list if the node is removed; None if it stays.
     """
     if node.op_type != "Cast" or node.inputs[0] not in shapes:
         return None
@@ -64,7 +95,18 @@ def drop_cast(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None
 
 
 def pool_mean(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a mean over rows and columns by GlobalAveragePool, and Flatten if it drops both."""
+    """Replace a mean over rows and columns by GlobalAveragePool, and a Flatten if both axes are
+    dropped.
+
+    Args:
+        shapes: the sizes of each float tensor by name, as `float_shapes` returns them. That of a
+            new tensor is added.
+        graph: the graph that the node belongs to.
+        node: any node.
+
+    Returns:
+        The nodes that replace the mean; None if the node is something else.
+    """
     # From opset 18 on the axes are an input.
     axes = {axis % 4 for axis in graph.numbers(node, 1, "axes") or ()}
     size = shapes.get(node.inputs[0], ()) if node.op_type == "ReduceMean" else ()

@@ -17,16 +17,17 @@ BLOCKS = (2, 3, 4)
 
 
 def unshuffle_slices(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Return the pixel unshuffle that a Concat of slices is (1).
+    """Replace slices of every n-th pixel that are concatenated by one pixel unshuffle (point 1 of
+    the module).
 
     Args:
-        shapes: the shapes of each float tensor.
-        graph: the graph that the node belongs to; convolutions that read the result get other
-            weights.
-        node: any node.
+        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
+        graph: the graph that the node belongs to. Convolutions that read the result get other
+            weights, because its channels may be in another order.
+        node: any node; only a Concat can be replaced.
 
     Returns:
-        The unshuffle, None if the node is something else.
+        The pixel unshuffle (SpaceToDepth); None if the node stays.
     """
     if node.op_type != "Concat" or node.attributes.get("axis") not in (1, -3):
         return None

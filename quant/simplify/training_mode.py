@@ -22,7 +22,7 @@ def require_inference(model: onnx.ModelProto, where: str) -> None:
     """Raise ModelError if a network has a node in training mode.
 
     Args:
-        model: accepted by `check_content`.
+        model: a model that `check_content` accepted.
         where: name of the network for the message, such as "a.onnx" or "the float network".
 
     Raises:

@@ -23,14 +23,19 @@ from beers_deploy.quant.untrusted import times
 
 @dataclass(frozen=True)
 class AxisMap:
-    """The effect of an operator along one side.
+    """The pixels of its source that an operator reads, along one side (rows or columns).
+
+    Pixel k of the result reads the source from k / growth + low, rounded up, to k / growth + high,
+    rounded down.
 
     Attributes:
-        growth: pixels of its result for one of its source.
-        extra: pixels that its result has beyond, or short of, its share of the image.
-        low: pixel k of the result reads its source from k / growth + low, rounded up,
-        high: to k / growth + high, rounded down.
-        mirrored: pixels beyond either end of the source for which it reads those within.
+        growth: the number of pixels of the result for one of the source.
+        extra: the number of pixels by which the result differs from its share of the image:
+            positive if it has more.
+        low: the first pixel that is read, relative to the pixel's own place.
+        high: the last pixel that is read, relative to the pixel's own place.
+        mirrored: the number of pixels beyond either end of the source in whose place mirrored ones
+            are read.
     """
 
     growth: Fraction
@@ -40,13 +45,15 @@ class AxisMap:
     mirrored: int = 0
 
     def reads(self, first: int, last: int, size: int) -> tuple[int, int]:
-        """Return the first and the last pixel of the source that pixels of the result read.
+        """Return the first and the last pixel of the source that a range of pixels of the result
+        reads.
 
         Args:
-            first: the first of the result's pixels.
-            last: the last of the pixels.
-            size: the size of the source where the image is one cell of the lattice: it may end on
-                either side of it.
+            first: the first pixel of the range.
+            last: the last pixel of the range.
+            size: the number of pixels of the source if the image is a single cell of the lattice
+                (the smallest step by which tiles may be moved). The source may end there, on either
+                side.
         """
         low = math.ceil(first / self.growth + self.low)
         high = math.floor(last / self.growth + self.high)
@@ -58,14 +65,15 @@ class AxisMap:
 
 @dataclass(frozen=True)
 class AxisNode:
-    """A node along one side of the image.
+    """A node whose effect along one side of the image is determined.
 
     Attributes:
         node: the node.
         axis: 0 for the rows, 1 for the columns.
-        extra: pixels that its source has beyond, or short of, its share of the image.
-        graph: the node's.
-        shapes: the shapes of all constants, including those that nodes compute from others.
+        extra: the number of pixels by which the node's source differs from its share of the image:
+            positive if it has more.
+        graph: the graph that the node belongs to.
+        shapes: the shapes of all constants by name, including those that nodes compute from others.
     """
 
     node: Node
@@ -75,8 +83,12 @@ class AxisNode:
     shapes: Mapping[str, tuple[int, ...]]
 
     def require(self, valid: bool, why: str) -> None:
-        """Raise ModelError unless the node can be tiled; `why` is a verb phrase on what it does
-        instead.
+        """Raise ModelError unless a condition for tiling holds.
+
+        Args:
+            valid: True if the node meets the condition.
+            why: a verb phrase for the message on what the node does instead, such as "has a fixed
+                size".
         """
         if not valid:
             raise not_tileable(
@@ -85,27 +97,46 @@ class AxisNode:
             )
 
     def attribute(self, key: str, otherwise: Any) -> Any:
-        """Return an attribute of the node."""
+        """Return an attribute of the node, or `otherwise` if the node does not state it."""
         return self.node.attributes.get(key, otherwise)
 
     def numbers(self, place: int, key: str, otherwise: Sequence[float] = ()) -> list[Any]:
-        """Return the numbers that the node states in an input or, in older opsets, in an
+        """Return the numbers that the node states in a constant input or, in older opsets, in an
         attribute.
+
+        Args:
+            place: the number of the input, from 0 on.
+            key: the name of the attribute.
+            otherwise: the numbers that are returned if the node states none.
+
+        Raises:
+            ModelError: other nodes compute the input.
         """
         values = self.graph.numbers(self.node, place, key, otherwise)
         self.require(values is not None, "has sizes that are computed (fold them)")
         return values or []
 
     def own(self, numbers: Sequence[Any], axes: Sequence[int], otherwise: Any) -> Any:
-        """Return the number for this side from numbers for `axes` of (N, C, H, W), or `otherwise`
-        if it has none.
+        """Select from numbers for several axes the one for the node's side, rows or columns.
+
+        Args:
+            numbers: one number for each of `axes`.
+            axes: axes of (N, C, H, W); a negative one counts from the last.
+            otherwise: the value that is returned if no number is for this side.
         """
         # A negative axis counts from the last one.
         by_axis = dict(zip((int(axis) % 4 for axis in axes), numbers, strict=True))
         return by_axis.get(2 + self.axis, otherwise)
 
     def slide(self, window: Window, kernel: int = 1, ceil: bool = False) -> AxisMap:
-        """Return the map of a window that slides over its padded source."""
+        """Return which pixels a window reads that slides over its padded source, such as a
+        convolution's.
+
+        Args:
+            window: strides, pads and dilations.
+            kernel: the number of pixels that the window reads along the side.
+            ceil: True if the last window may reach beyond the padding (ONNX's `ceil_mode`).
+        """
         extra = window.output_size(self.axis, kernel, self.extra, ceil)
         before = window.pads[self.axis]
         high = window.extent(self.axis, kernel) - 1 - before
@@ -113,7 +144,12 @@ class AxisNode:
         return AxisMap(growth, extra, Fraction(-before), Fraction(high))
 
     def transpose(self, window: Window, kernel: int) -> AxisMap:
-        """Return the map of a transposed window; the padding cuts its result."""
+        """Return which pixels a transposed convolution reads, whose pads cut its result.
+
+        Args:
+            window: strides, pads and dilations.
+            kernel: the number of weights along the side.
+        """
         stride = window.strides[self.axis]
         before = window.pads[self.axis]
         extra = window.transposed_size(self.axis, kernel, self.extra)
@@ -254,7 +290,11 @@ their first input.
 
 
 def not_tileable(reason: str) -> ModelError:
-    """Return the error of a network that cannot be tiled; `reason` may have names from a file."""
+    """Build the error for a network whose image cannot be cut into tiles.
+
+    Args:
+        reason: a clause on why, which may contain names from a file.
+    """
     return ModelError(
         f"The network cannot be tiled: {printable(reason, 4 * LONGEST)}. Give a network that "
         "computes one image from one image, each pixel from near pixels only."

@@ -37,17 +37,21 @@ from beers_deploy.quant.untrusted import contradictions
 
 @dataclass(frozen=True)
 class Tiling:
-    """The geometry by which an image is tiled for a network (see the description of the module).
+    """How an image may be cut into tiles for a network, so that the result equals that of the whole
+    image.
+
+    The description of the module states the procedure.
 
     Attributes:
-        halo_px: context around the kept part of a tile: the receptive radius, rounded up to the
-            lattice.
-        alignment_px: tiles begin and end at multiples of it; 1 without strides.
-        scale: pixels of the output for one of the image, along either side.
+        halo_px: the number of pixels around the kept part of a tile that must be read too: the
+            receptive radius, rounded up to a multiple of `alignment_px`.
+        alignment_px: tiles begin and end at multiples of this number of pixels; 1 without strides.
+        scale: the number of pixels of the output for one of the image, along either side.
         channels_in: the number of bands that the network reads jointly.
         channels_out: the number of bands that it returns.
-        fixed_px: the tile side that the network is fixed to; None if it accepts any size.
-        min_side_px: the shortest side that it accepts: one pixel more than it mirrors at a border.
+        fixed_px: the side of the image that the network is fixed to; None if it accepts any size.
+        min_side_px: the shortest side of an image that it accepts: one pixel more than it mirrors
+            at a border.
     """
 
     halo_px: int
@@ -59,12 +63,17 @@ class Tiling:
     min_side_px: int = 1
 
     def whole_px(self, side_px: int) -> int:
-        """Return the length to which a side of an image is extended, at the bottom and right."""
+        """Return the length in pixels to which a side of an image is extended, at the bottom or
+        right, before it is cut.
+
+        Args:
+            side_px: the length of the side.
+        """
         return -(-max(side_px, self.min_side_px) // self.alignment_px) * self.alignment_px
 
     @property
     def words(self) -> str:
-        """A description for messages."""
+        """A description of bands, scale and alignment for messages."""
         bands = f"of {self.channels_in} bands in and {self.channels_out} out"
         return (
             f"{bands}, a result of {self.scale} times the image's size and tiles of "
@@ -73,14 +82,14 @@ class Tiling:
 
 
 def tiling_of(model: onnx.ModelProto, where: str = "") -> Tiling:
-    """Return how an image may be tiled for a network, float or INT8.
+    """Determine how an image may be cut into tiles for a network, float or INT8.
 
     Args:
         model: the network.
-        where: its file, which messages then name.
+        where: the name of the network for messages, such as that of its file.
 
     Raises:
-        ModelError: a network that cannot be tiled; the sentence names the node.
+        ModelError: the network cannot be tiled; the message names the node that prevents it.
     """
     with faults_named(where), contradictions(where or "the network"):
         graph = with_shuffles(model)
