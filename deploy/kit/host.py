@@ -61,9 +61,9 @@ def shuffled(x: np.ndarray, r: int, up: bool) -> np.ndarray:
 
 
 def encoded(image: np.ndarray) -> np.ndarray:
-    """Encode a tile (1, C, h, w) as the core's planes (1, P, h', w'): coarse, remainder and part.
+    """Encode a tile (1, C, h, w) as the planes (1, P, h', w') that the core reads as int8 / 128.
 
-    They are multiples of 1/128, because the core reads int8 at that scale.
+    Each pixel in 12 bits is split into coarse steps and a rest, which is also given in parts.
     """
     wide = np.pad(image, ((0, 0), (0, 0), *[(S["border_px"],) * 2] * 2), "reflect")
     places = shuffled(wide, S["front"], up=False)
@@ -76,22 +76,22 @@ def encoded(image: np.ndarray) -> np.ndarray:
 
 
 def plain(value: np.ndarray) -> np.ndarray:
-    """Return the only copy of a result unchanged."""
+    """Decode a result of which the core writes only one copy: return it unchanged."""
     return value
 
 
 def fits(fine: np.ndarray) -> np.ndarray:
-    """Return a mask of the values of a fine copy that are not clipped."""
+    """Return True for the values of a copy in fine steps that the limits of int8 do not clip."""
     return np.asarray(np.abs(fine) <= F(S["fine_max"]))
 
 
 def dual_range(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
-    """Choose the fine copy where it is not clipped, else the coarse one."""
+    """Merge two copies of a result: where the one in fine steps is clipped, take the coarse one."""
     return np.where(fits(fine), fine, coarse * F(S["gain"]))
 
 
 def offset_windows(coarse: np.ndarray, *windows: np.ndarray) -> np.ndarray:
-    """Merge a coarse copy (1, C, h, w) of a result with fine ones of values around their offsets.
+    """Merge a coarse copy (1, C, h, w) of a result with copies in fine steps around offsets.
 
     A value is taken from the last window that does not clip it, or else from the coarse copy.
     """
@@ -102,7 +102,7 @@ def offset_windows(coarse: np.ndarray, *windows: np.ndarray) -> np.ndarray:
 
 
 def bank_sum(fine: np.ndarray, coarse: np.ndarray, *analytic: np.ndarray) -> np.ndarray:
-    """Return the sum of the correction and of the copies of the analytic restoration."""
+    """Add the network's correction and the linear restoration, which has several copies."""
     added = np.sum(analytic[: S["fine_copies"]], 0) * F(S["fine_gain"])
     # The last copy may be a coarse one, for values at which the others are clipped.
     if S["coarse_gain"]:
@@ -137,9 +137,8 @@ def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
 
 
 def exposed(factor: int, image: np.ndarray, run: Any) -> np.ndarray:
-    """Restore a tile whose light is multiplied by a factor by that factor's core, and divide it.
-
-    The dark offset is not light and stays.
+    """Multiply the light of a tile (1, C, h, w) by a factor, restore it by that factor's core
+    `run`, and divide the result. The sensor's dark offset is not light and stays.
     """
     if factor == 1:
         return restored(image, run, UNITS[1])
@@ -212,7 +211,7 @@ def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def detail(raw: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Compute the part for finer detail from one band and `near`, x with NEAR pixels around it.
+    """Compute the correction (H, W) of finer detail from a raw band and `near`, x extended by NEAR.
 
     It is the residual of fine blocks without that of the large ones, and 0 at the image's border.
     """
@@ -306,7 +305,7 @@ def block_means(x: np.ndarray, side: int = BLOCK) -> np.ndarray:
 
 
 def around(means: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """Compute the far part of H x: the means around each block, weighted by `far`."""
+    """Compute the far part of the blur H x: `far` weights the block means around each block."""
     height, width = (size - len(far) + 1 for size in means.shape)
     total = np.zeros((height, width), F)
     for y, weights in enumerate(far):
@@ -316,7 +315,7 @@ def around(means: np.ndarray, far: np.ndarray) -> np.ndarray:
 
 
 def inner(count: int) -> tuple[int, int]:
-    """Return the first and the end of the blocks that count among `count` along a side."""
+    """Return (first, end) of the blocks that count: of more than 4, all but 2 at each end."""
     return (2, count - 2) if count > 4 else (0, count)
 
 
