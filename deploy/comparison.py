@@ -246,7 +246,8 @@ def compare(
 
     Raises:
         ModelError: a file is not a valid network of the expected kind.
-        OptionError: there is no INT8 network, or the metric is unknown.
+        OptionError: there is no INT8 network, the metric is unknown, or images are given together
+            with samples.
         ImageError: the networks do not accept the samples.
 
     Examples:

@@ -127,9 +127,13 @@ def _is_shipped(path: Path) -> bool:
 
 
 def require_known(path: Path) -> Path:
-    """Return the path of a network if it can be a file or a shipped name.
+    """Refuse a word that can be neither the file of a network nor the name of a shipped one.
 
-    A path with a suffix is returned without a check that the file exists.
+    Args:
+        path: the word of the user. With a suffix it passes, whether or not the file exists.
+
+    Returns:
+        The same path.
 
     Raises:
         ModelError: the path has no suffix, does not exist, and is not the name of a shipped

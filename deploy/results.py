@@ -130,7 +130,7 @@ class Table:
 
     @property
     def verdict(self) -> str:
-        """A sentence that states whether the checks passed; empty without checks."""
+        """A sentence that states whether all checks passed, and which failed; "" without checks."""
         if not self.checks:
             return ""
         if self.failed:
@@ -230,7 +230,7 @@ class Table:
         return Path(path)
 
     def to_markdown(self) -> str:
-        """Return the title, the tables, checks, notes and the verdict as Markdown."""
+        """Render the title, the tables, checks, notes and the verdict as Markdown text."""
         lines = [f"# {markdown_text(self.title)}", ""] if self.title else []
         for heading, rows in self.shown().items():
             lines += [f"## {markdown_text(heading)}", "", *markdown_table(rows), ""]

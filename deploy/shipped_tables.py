@@ -177,7 +177,7 @@ def _sensor_rows(sensor: Sensor) -> list[Row]:
 
 
 def _response(sensor: Sensor) -> list[Row]:
-    """Return a table's numbers, or the components of a point-spread function."""
+    """Return the rows of a sensor's MTF: a measured table, or parts of a point-spread function."""
     response = sensor.response
     words = {"status": sensor.mtf_nyquist.status, "source": sensor.mtf_nyquist.source}
     if response is None:

@@ -211,7 +211,7 @@ class Verdict(Table):
             raise GateFailedError(self.verdict)
 
     def to_junit(self) -> str:
-        """Return the verdict as JUnit XML: a test case for each check."""
+        """Return the verdict as JUnit XML, which CI servers read: a test case for each check."""
         return junit_text(f"INT8 gate of {self.comparison.int8.name}", self.checks)
 
     @property
@@ -229,7 +229,7 @@ class Verdict(Table):
 
 
 class GateFailedError(AssertionError):
-    """An INT8 network exceeds a limit. This is not bad input, so it is not a `BeersError`."""
+    """The error of `Verdict.raise_if_failed`. It is not bad input, so it is no `BeersError`."""
 
 
 def baseline_for(

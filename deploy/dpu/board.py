@@ -15,7 +15,7 @@ BoardLike = TargetProfile | str | os.PathLike[str]
 """A board: its profile, its name, or the path of its .toml file."""
 
 Levels = tuple[int, ...]
-"""What a run has in common with others, from the most general (`cost/kinship.py`)."""
+"""Keys that two measured runs share if they have a property in common (`cost/kinship.py`)."""
 
 ALL = "all"
 """Every shipped board, or every configuration."""
@@ -102,7 +102,7 @@ class Dpu:
 
     @property
     def channels_max(self) -> int:
-        """The largest number of channels of an operator on the array."""
+        """The largest number of input or output channels of an operator on the DPU's array."""
         return self.whole("array", "channel_groups") * self.input_parallel
 
     @property

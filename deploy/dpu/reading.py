@@ -72,8 +72,11 @@ def own_tile_px(model: onnx.ModelProto) -> int | None:
 
 
 def _places(model: onnx.ModelProto) -> tuple[int, int]:
-    """Return what a board's file states about its planes: the side of a place in pixels, and how
-    far they extend beyond the image.
+    """Read the geometry of the planes from the metadata of a board's file.
+
+    Returns:
+        The side in pixels of a place, a square of pixels that the host moves into channels; and the
+        number of pixels by which the planes extend beyond the image on every side.
     """
     about = metadata(model)
     place_px = int(about.get(PLACE_PX, 1))
@@ -130,7 +133,9 @@ def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str) -> dict[s
 
 
 class _Reader:
-    """Visits the nodes once in topological order, and propagates shapes and number formats."""
+    """A conversion of one ONNX graph, which visits the nodes once in topological order and
+    propagates shapes and number formats.
+    """
 
     def __init__(self, graph: OnnxGraph, inputs: dict[str, Shape]) -> None:
         self.graph = graph

@@ -27,8 +27,9 @@ def require_core_file(
         inputs: the files that the run reads, which the configuration may not replace.
 
     Raises:
-        OptionError: the board has an NPU, and there is no tile, or the configuration cannot be
-            written.
+        OptionError: the board has an NPU, and there is no tile, or the configuration would replace
+            an input.
+        MachineError: the configuration cannot be written.
     """
     if path is not None and target.npu:
         required_tile(tile, OF_NPU)

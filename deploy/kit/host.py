@@ -47,7 +47,7 @@ UNITS = {1: S["unit"], **{int(factor): unit for factor, unit in S["exposures"].i
 
 
 def shuffled(x: np.ndarray, r: int, up: bool) -> np.ndarray:
-    """Move squares of r x r pixels of (1, C, H, W) into the channels.
+    """Move squares of r x r pixels of (1, C, H, W) into the channels: (1, C r^2, H / r, W / r).
 
     If `up`, move channels back into pixels: (1, C / r^2, r H, r W).
     """
@@ -122,7 +122,7 @@ host.json.
 
 
 def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
-    """Restore a tile (1, C, h, w) by one core: encode it, decode the result, and add both.
+    """Restore a tile (1, C, h, w) by one core: encode it, decode the result, and add the tile.
 
     `run` computes the core's result (1, copies C', h', w') from the planes, and `unit` is the share
     of full scale that is 1 in the decoded result.
@@ -148,7 +148,7 @@ def exposed(factor: int, image: np.ndarray, run: Any) -> np.ndarray:
 
 
 def factors(tile: np.ndarray) -> np.ndarray:
-    """Choose the factor of every pixel (h, w) of a tile (1, C, h, w).
+    """Choose the exposure, a factor of brightness, of every pixel (h, w) of a tile (1, C, h, w).
 
     A pixel gets the largest factor at which no pixel within the network's receptive radius exceeds
     `headroom`.
@@ -180,7 +180,7 @@ def brightest_around(pixels: np.ndarray, radius: int) -> np.ndarray:
 
 
 def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return x + G (raw - H x) of one band (H, W), clipped to [0, 1].
+    """Correct a restored band x (H, W) to x + G (raw - H x), clipped to [0, 1].
 
     H is the sensor's blur relative to the reference. G computes the means of blocks and
     interpolates between their centres, which retains only low spatial frequencies.
@@ -229,7 +229,7 @@ def detail(raw: np.ndarray, near: np.ndarray) -> np.ndarray:
 
 
 def judged(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return two figures (2, n, m) of each block of CHECK pixels a side of one band (H, W).
+    """Compute the self-check of one band (H, W): two figures (2, n, m) of blocks of CHECK pixels.
 
     The first is chi2, the mean of (raw - H x)^2 / variance of the noise, in which the means of
     small cells count less. The second is the mean of (x - H x)^2 / variance, which shows whether a
@@ -260,14 +260,14 @@ def judged(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def sums(values: np.ndarray, side: int) -> np.ndarray:
-    """Return the sums over squares of `side` values a side of (H, W)."""
+    """Return the sums of an array (H, W) over squares of `side` x `side` values, (n, m)."""
     down, across = (np.arange(0, length, side) for length in values.shape)
     by_rows = np.add.reduceat(values, down, 0, dtype=float)
     return np.asarray(np.add.reduceat(by_rows, across, 1))
 
 
 def report(blocks: np.ndarray) -> str:
-    """Return a sentence on the blocks (bands, 2, n, m) that contradict the raw image."""
+    """Count the blocks that contradict the raw image, in a sentence; blocks (bands, 2, n, m)."""
     facts = S["self_check"]
     chi2 = blocks[:, 0]
     sharpening = blocks[:, 1]
@@ -320,7 +320,7 @@ def inner(count: int) -> tuple[int, int]:
 
 
 def interpolated(blocks: np.ndarray, shape: tuple[int, ...], side: int = BLOCK) -> np.ndarray:
-    """Interpolate bilinearly between the centres of blocks of `side` pixels.
+    """Interpolate bilinearly between the centres of blocks of `side` pixels, to (H, W) = `shape`.
 
     Blocks at the image's border are left out, because H brings light into them that the image does
     not show. Nearer to the border the nearest block inside counts.
@@ -335,7 +335,7 @@ def interpolated(blocks: np.ndarray, shape: tuple[int, ...], side: int = BLOCK) 
 
 
 def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
-    """Return the start of each tile along a side, and the start and end of its retained pixels.
+    """Return the start of each tile along `size` pixels, and start and end of its retained pixels.
 
     Tiles overlap by at least two halos, the pixels that are discarded at a tile's inner borders.
     """
@@ -347,7 +347,7 @@ def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
 
 
 def main(source: str, target: str, runs: dict[int, Any]) -> None:
-    """Restore an image of at least a tile, tile by tile, by the core of each factor in `runs`."""
+    """Restore the image in `source` into `target`, tile by tile; `runs` has each factor's core."""
     image = np.load(source).astype(F)
     t = S["tile_px"]
     r = S["scale"]
@@ -380,7 +380,7 @@ def main(source: str, target: str, runs: dict[int, Any]) -> None:
 
 
 def cores() -> dict[int, Any]:
-    """Open the core of each factor in onnxruntime; a board has runners of its own instead."""
+    """Open the core of each exposure factor in onnxruntime; a board has other runners instead."""
     import onnxruntime as ort
 
     # onnxruntime's fused kernels may saturate.

@@ -61,8 +61,8 @@ def write_record(
 ) -> None:
     """Write a record of evidence: what an INT8 network is, what made it, and what was checked.
 
-    It is written as JSON, as an HTML page and as a CycloneDX 1.6 bill of materials. All three
-    are written, or none.
+    It is written as JSON, as an HTML page and as a CycloneDX 1.6 bill of materials. All three are
+    composed before the first is written.
 
     Args:
         judged: the result of `gate` or `check` for the network.
@@ -193,7 +193,7 @@ def bill_of(document: dict[str, Any]) -> str:
         document: the record, as `record_of` returns it.
 
     Returns:
-        JSON text, the same for the same record.
+        JSON text. The serial number of the bill is derived from the record.
     """
     from cyclonedx.model import HashAlgorithm, HashType, Property
     from cyclonedx.model.bom import Bom

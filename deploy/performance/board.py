@@ -208,9 +208,9 @@ def bench_board(
 
 
 def _counted_alike(network: Network, asked: Question, swath: Swath) -> list[Row]:
-    """Return the swath in tiles as the paper counts them, to stand next to the paper's run.
+    """Predict the swath in tiles as the paper counts them, for comparison with the paper's run.
 
-    Whole tiles with a halo are more work than the paper counts: their time is no match for its.
+    Whole tiles with a halo are more work than the paper counts, so their time is not comparable.
     """
     boards = {dpu.name: dpu for dpu in asked.boards if dpu.target.name == PAPER_TARGET}
     first = next(iter(boards.values()))
@@ -222,7 +222,7 @@ def _counted_alike(network: Network, asked: Question, swath: Swath) -> list[Row]
 def _table(
     network: Network, boards: Sequence[Dpu], tables: Tables, notes: Sequence[str], **more: Any
 ) -> Bench:
-    """Return tables with titles as one table."""
+    """Join tables with titles to the one table that `bench` returns."""
     rows = list(chain.from_iterable(part for _, part in tables))
     headings = {part[0].table: title for title, part in tables if part}
     first = rows[0].table
@@ -293,7 +293,7 @@ def _layers(network: Network, prediction: Prediction) -> tuple[str, list[Row]]:
 
 
 def _frames(network: Network, asked: Question, why: ModelError) -> Bench:
-    """Return the network on whole images; of one configuration each layer too."""
+    """Predict a network that runs on whole images. For one configuration, list each layer too."""
     # A network that is fixed to one size runs at that size alone.
     size_px = None if own_tile_px(network.model) else TILE_PX
     predictions = [predict_network(network, dpu, size_px, asked.task) for dpu in asked.boards]

@@ -71,12 +71,13 @@ def _read(powercap: Path) -> dict[Path, int] | str:
 def interleaved(
     calls: Sequence[Callable[[], object]], rounds: int, least_s: float = 0.0
 ) -> list[list[tuple[float, Figure]]]:
-    """Time several calls in turn, once per round.
+    """Time several calls in turn, once per round, so that other load affects all of them alike.
 
     Args:
         calls: the functions to time, already warmed up.
-        rounds: the least number of rounds.
-        least_s: the least total time of each call. Rounds are added until it is reached.
+        rounds: the smallest number of rounds.
+        least_s: the shortest total time of each call in s. Rounds are added until every call has
+            reached it.
 
     Returns:
         For each call, the time in s and the power of each round.

@@ -187,7 +187,7 @@ def fully_connected(op: Operation) -> bool:
 
 
 def all_rules() -> Iterator[Rule]:
-    """Yield every rule once, in the order of the tables."""
+    """Yield every rule of any DPU once, in the order of RULES, EVERY, NUMBERS and SHIFTS."""
     tables = [*RULES.values(), EVERY, NUMBERS, *SHIFTS.values()]
     yield from dict.fromkeys(chain.from_iterable(tables))
 
@@ -221,7 +221,9 @@ def applies(rule: Callable[..., object], dpu: Dpu) -> bool:
 
 
 def rule_text(rule: Callable[..., object], dpu: Dpu) -> str:
-    """Return the text of a rule or a remark, with the target's limits and documents filled in."""
+    """Return the text of a rule or a remark: its docstring, in which the limits and documents of
+    the device's board are filled in.
+    """
     return _template(rule).format(**_facts(dpu))
 
 

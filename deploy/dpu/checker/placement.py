@@ -196,8 +196,10 @@ def _parts(network: SizedGraph) -> list[Part]:
 def _left_to_the_host(
     network: SizedGraph, parts: list[Part], broken: list[tuple[Broken, ...]]
 ) -> list[Part]:
-    """Return the parts with more nodes left to the host. After the last convolution, a node that
-    reads a result of the CPU stays there, so that the tensor is not transferred again.
+    """Leave more nodes of a float network to the host, and return the part of each node.
+
+    After the last convolution, a node that reads a result of the CPU stays on the CPU, so that the
+    tensor is not transferred again.
     """
     before = _reached(network.operations, _convolved(network), forwards=False)
     cpu_results: set[str] = set()

@@ -56,7 +56,7 @@ class Checked(Table):
 
     @property
     def verdict(self) -> str:
-        """A sentence that states whether the network fits."""
+        """A sentence that states whether the device can run the network, and what that rests on."""
         if self.failed:
             return f"check FAILED: {'; '.join(map(str, self.failed))}"
         if self.dpu.target.npu:

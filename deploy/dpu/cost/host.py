@@ -99,8 +99,8 @@ place and size, a score, and a class.
 def _scores(placement: Placement) -> float:
     """Return the share of the results that a sort reads.
 
-    The host skips a box whose score is low. A file with maps of one number of channels, a multiple
-    of BOXES, is taken as YOLO's; of others, which have classes apart from places, all is read.
+    The host skips a box whose score is low. A network is taken for YOLO if all its results have the
+    same number of channels, a multiple of BOXES. All results of other networks are read.
     """
     back = {cut.tensor for cut in placement.cuts if not cut.onto_dpu}
     channels = {

@@ -171,7 +171,7 @@ class Prediction:
 
     @property
     def spread(self) -> float:
-        """Return the factor by which each time may be wrong in either direction."""
+        """Return e^width, the factor by which the rate and each time may be wrong either way."""
         return math.exp(self.width)
 
     @property
@@ -191,7 +191,7 @@ class Prediction:
 
     @property
     def operations(self) -> int:
-        """Return the int8 operations for one image."""
+        """Return the number of int8 operations of all layers on the DPU, for one image."""
         return sum(layer.work.operations for layer in self.layers)
 
     @property
@@ -278,7 +278,7 @@ def predict(
 
 
 WIDTHS = {part: f"width_{part}" for part in (*PARTS, "outside")}
-"""Where [cost] keeps half the width of an interval, in ln(FPS)."""
+"""The key in [cost] of half the width of an interval, in ln(FPS), by the part of the time."""
 ROUNDED = 1e-3
 """How far [cost] rounds the ends of the fitted range: the largest fitted
 network is not beyond it.

@@ -61,7 +61,11 @@ class Constants:
 
     @classmethod
     def of(cls, dpu: Dpu) -> Self:
-        """Read the constants that a target profile states in [cost]."""
+        """Read the constants that a board's profile states in its table [cost].
+
+        Raises:
+            ProfileError: the profile lacks one, because the board has no cost model.
+        """
         return cls(*(dpu.value("cost", name) for name in NAMES))
 
     @property
@@ -81,7 +85,10 @@ NAMES = tuple(field.name for field in fields(Constants))
 
 @dataclass(frozen=True)
 class Structure:
-    """The parameters of the formula that depend on the kind of the board and are not fitted."""
+    """The parameters of this module's formula that depend on the kind of board.
+
+    In contrast to `Constants`, they are not fitted.
+    """
 
     overlap: float
     """Share of the shorter of compute and memory that is hidden behind the longer."""
@@ -211,8 +218,9 @@ ZCU104, where AMD's profile of its layers has 3.2 to 3.7.
 """
 
 PARTS = ("array", "lanes", "memory", "start", "copies", "task")
-"""What the time of an image consists of: the array, the engines beside it, transfers and starts on
-the DPU, then the host's copies and its task. The prediction of each is off by a width of its own.
+"""The parts of the time of an image: on the DPU the convolution array, the element-wise engine,
+transfers and starts of layers; on the host the copies and its task. Each part has an uncertainty of
+its own.
 """
 
 

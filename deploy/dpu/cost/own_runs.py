@@ -132,6 +132,7 @@ def read_own_runs(path: Path, dpu: Dpu) -> OwnRuns:
         OptionError: the file is not a list of measurements; or one is of another DPU, of
             onnxruntime's CPU provider, or too far from its prediction to be of the same network.
         ModelError: a network cannot be read, or does not run on the DPU.
+        ProfileError: there is no such board or configuration.
     """
     try:
         entries = ENTRIES.validate_python(read_json(path))

@@ -176,14 +176,14 @@ def _up(count: int, size: int) -> int:
 
 
 class _Flow:
-    """Which results pass through memory: what banks cannot hold, or not for long, and what a concat
-    joins.
+    """The maps of a network that pass through memory, because the banks on the chip cannot hold
+    them, too many operations read them, or a concat joins them.
 
-    An add or mul is fused with the operation before it, which stores the result. Of maps that do
-    not fit the chip the other operand is loaded, and nothing hides that.
+    An add or mul is fused with the operation before it, which stores the result. If the maps do not
+    fit on the chip, the other operand is loaded from memory, and nothing hides that transfer.
 
-    What a concat joins, and what a pixel shuffle moves, is stored pixel by pixel between what
-    others store: a pixel's channels take whole bursts.
+    The operands of a concat, and the map that a pixel shuffle moves, are stored interleaved with
+    those of other operations, so that the channels of each pixel take whole bursts.
     """
 
     def __init__(self, operations: Sequence[Operation], dpu: Dpu) -> None:
