@@ -62,8 +62,9 @@ class Network:
     """One ONNX network for image restoration, in float32 or INT8, and its origin.
 
     `Network.load` makes one from a file, a shipped name, an ONNX model or a torch module. Call the
-    instance to run it on images. "In this process" below means that `quantize` was called in the
-    same Python process, rather than the network read from a file.
+    instance to run it on images. The filters of a sensor-conditioned network are computed from the
+    blur and noise of one sensor. "In this process" below means that `quantize` was called in the
+    same Python process, in contrast to a network that was read from a file.
 
     Attributes:
         model: the ONNX model.

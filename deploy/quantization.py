@@ -267,8 +267,8 @@ def sensitivity_report(
         network: the INT8 network that `quantize_alone` returned.
         held_out: the samples held out from calibration.
         differences: the differences measured on these samples.
-        prices: the rows of `price_rows`, the PSNR lost by each step of quantisation, which the page
-            shows as well.
+        prices: the rows of `price_rows`, the loss that each restriction of the DPU's integers adds,
+            which the page shows as well.
 
     Returns:
         The rows (the differences, the error of each layer, the worst samples, the sizes of the
