@@ -303,6 +303,9 @@ def rounding_of(int8: Path, weights: Path) -> "Rounding":
         int8: the INT8 file.
         weights: the .safetensors file that it was quantised from.
 
+    Returns:
+        The step size of each channel of the tensors between the layers, as torch tensors.
+
     Raises:
         ModelError: the INT8 file was quantised from other weights, or is not conditioned on a
             sensor.

@@ -198,7 +198,13 @@ def one_thread_latency(prediction: Prediction) -> Figure:
 
 
 def swath_latency(prediction: Prediction, batches: float) -> Figure:
-    """Return the time of a number of batches in s, which may be a fraction of one."""
+    """Predict the time in s that a DPU and its host need for a number of batches.
+
+    Args:
+        prediction: the prediction of the network. A batch is the images that the DPU computes at
+            once.
+        batches: the number of batches, which may be a fraction.
+    """
     images = batches * prediction.batch
     # The lower end of the rate is the upper end of the time.
     slow_s, fast_s = (images / fps for fps in prediction.fps_interval)

@@ -111,7 +111,7 @@ class Placement:
 
     @property
     def dpu_subgraphs(self) -> int:
-        """The number of subgraphs that the DPU runs, each with its own transfers."""
+        """The number of parts of the network that the DPU runs without a transfer in between."""
         return len({node.subgraph for node in self.nodes if node.device == "DPU"})
 
     @property
