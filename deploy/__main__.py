@@ -11,8 +11,10 @@ load."""
 
 
 def main() -> None:
-    """Run the command line. A library that does not load ends it with 70, because 1 means that a
-    gate failed.
+    """Run the command line `beers-deploy`.
+
+    The exit code is 70 if a library of the installation does not load. Python's own code for an
+    uncaught error, 1, would mean that a gate failed.
     """
     try:
         from beers_deploy.cli.commands import app

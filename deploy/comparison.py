@@ -47,16 +47,21 @@ IN_MEMORY = "in memory"
 
 @dataclass(frozen=True)
 class Data:
-    """The data on which a network is calibrated or evaluated.
+    """The choice of data on which a network is calibrated or evaluated; nothing is read yet.
+
+    The data are either simulated patches, square images as the sensor would acquire them, or the
+    user's own samples.
 
     Attributes:
-        sensor: the sensor of the simulated patches.
-        samples: the user's own, in place of patches; None for none.
-        images: folder of scenes for the patches; None for drawn ones.
-        patches: number of patches.
-        seed: the seed of the patches.
-        patch_px: side of a patch. Those of a gate have 128 pixels.
-        input_range: the input range of the samples, as the user states it; None to find it.
+        sensor: the sensor whose images the patches imitate.
+        samples: the user's samples, as `quantize` accepts them; None for simulated patches.
+        images: folder of scenes to simulate the patches from; None for scenes drawn at random.
+        patches: the number of patches.
+        seed: the seed of every random draw of the patches.
+        patch_px: side in pixels of a patch that calibration draws. Patches of a comparison always
+            have 128 pixels a side.
+        input_range: the range of the samples' values, as the user states it; None to determine it
+            from the samples.
     """
 
     sensor: Sensor
@@ -68,12 +73,20 @@ class Data:
     input_range: object = None
 
     def own(self, network: Network, int8: Network | None = None) -> OwnSamples | None:
-        """Read the user's samples for a network, or return None for simulated patches.
+        """Read the user's samples in the units of a network.
 
         Args:
             network: the float network.
-            int8: its INT8 network if there is one. Its stated ranges say what pixels of image files
-                stand for, as in `restore`.
+            int8: the INT8 network made from it, if there is one. If a user stated the range of its
+                input, the pixels of image files are scaled to that range, as in `restore`.
+
+        Returns:
+            The samples; None if `samples` is None and simulated patches suit the network.
+
+        Raises:
+            ImageError: the network does not accept the samples, or they are far outside the range
+                that `int8` reads.
+            OptionError: there are no samples, and simulated patches do not suit the network.
         """
         ranges = self.input_range
         if int8 is not None and self._has_pictures:
@@ -94,7 +107,7 @@ class Data:
 
     @property
     def simulated(self) -> "Calibration":
-        """The source of simulated patches."""
+        """The simulator of the patches that `sensor`, `images`, `patches` and `seed` define."""
         # This loads SciPy, which samples of one's own do without.
         from beers_deploy.quant.samples.simulated import Calibration
 
@@ -102,7 +115,7 @@ class Data:
 
     @property
     def arguments(self) -> dict[str, object]:
-        """The arguments that describe the data of the comparison."""
+        """The arguments that describe the data in a results document, by name."""
         samples = self.samples
         if isinstance(samples, str | os.PathLike):
             samples = os.fspath(samples)
@@ -118,7 +131,7 @@ class Data:
 
     @property
     def inputs(self) -> list[Input]:
-        """The images and samples in files, as inputs of the figures."""
+        """The name and SHA-256 of the scenes and of the samples, as far as they are files."""
         inputs = []
         if self.images is not None:
             inputs.append(_files_input("scenes", self.images, list_images(self.images)))
@@ -129,10 +142,14 @@ class Data:
 
 
 def require_in_range(ranges: Ranges, int8: Network) -> None:
-    """Raise ImageError if samples are far outside the range that an INT8 network of ours reads.
+    """Raise ImageError if samples are far outside the range that an INT8 network reads.
+
+    A common cause is samples in digital numbers for a network of values in [0, 1]. Networks that
+    `quantize` did not write do not record their range, and pass.
 
     Args:
-        ranges: the ranges of the samples' channels; empty if all are in [0, 1].
+        ranges: (low, high) of the values of each channel of the samples; empty if all are in
+            [0, 1].
         int8: the INT8 network.
 
     Raises:
@@ -152,7 +169,7 @@ def require_in_range(ranges: Ranges, int8: Network) -> None:
 
 
 def sensor_input(sensor: Sensor) -> Input:
-    """Return a sensor as an input of the figures: its name, and the digest of its values."""
+    """Return the name of a sensor and a SHA-256 of its values, as results list their inputs."""
     text = json.dumps(numbers_of(sensor), sort_keys=True, default=str)
     return Input(f"sensor {sensor.name}", hashlib.sha256(text.encode()).hexdigest())
 
@@ -174,15 +191,15 @@ def _files_input(kind: str, path: Path, files: Iterable[Path]) -> Input:
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Comparison(Table):
-    """The differences between a float and an INT8 network, and the share of saturated values inside
-    the INT8 network.
+    """The result of `compare`: the differences between a float network and its INT8 network.
 
     Attributes:
-        result: the differences.
-        shares: for each layer, the share of its results at the limits of 8 bits.
+        result: the differences, such as the MAE over full scale and PSNRs in dB.
+        shares: for each layer by name, the share in [0, 1] of its results that are at the limits of
+            8 bits, where INT8 saturates.
         floating: the float network.
         int8: the INT8 network.
-        rests_on: the inputs of the figures in addition to the networks.
+        rests_on: the name and SHA-256 of the sensor, scenes and samples that were used.
     """
 
     result: GateResult
@@ -208,22 +225,29 @@ def compare(
     """Compare a float and an INT8 network on samples that were not used for calibration.
 
     Args:
-        float_network: the float network. The name of a shipped pair, or an INT8 network that was
-            quantised in this process, stands for both.
-        int8_network: its INT8 network.
+        float_network: the float network. The name of a shipped network, or the `Network` that
+            `quantize` returned, stands for both networks; None for the shipped convbeers-s.
+        int8_network: the INT8 network that was made from it; None if `float_network` stands for
+            both.
         samples: a path, arrays or any input that `quantize` accepts; simulated patches if None.
-        sensor: the sensor of the simulated patches and of shipped networks.
-        images: folder of scenes for the patches; drawn ones if None.
+        sensor: the sensor whose images the patches imitate and that shipped networks are
+            conditioned on.
+        images: folder of scenes to simulate the patches from; None for scenes drawn at random.
         patches: number of simulated patches, 128 x 128 pixels each.
         seed: the seed of the patches.
-        metric: psnr, ssim or mae: also compare the results with the references.
+        metric: psnr, ssim or mae, to also compare each network's results with the references; None
+            for no comparison with them.
         output: name of the output to compare, if a network has several.
         progress: a function that is called at each step, False for silence, None for a bar or lines
             on standard error.
 
+    Returns:
+        A table of the differences. It has no checks: `gate` adds limits.
+
     Raises:
         ModelError: a file is not a valid network of the expected kind.
-        OptionError: there is no INT8 network, or the metric is unknown.
+        OptionError: there is no INT8 network, the metric is unknown, or images are given together
+            with samples.
         ImageError: the networks do not accept the samples.
 
     Examples:
@@ -250,14 +274,14 @@ def compare(
 def compared(
     floating: Network, int8: Network, data: Data, own: OwnSamples | None, metric: str
 ) -> Comparison:
-    """Run both networks, and return their differences.
+    """Run both networks on the same data, and measure their differences; the work of `compare`.
 
     Args:
         floating: the float network.
         int8: the INT8 network.
-        data: the data they are compared on.
-        own: the user's samples, as `data` reads them; None for simulated patches.
-        metric: also compare the results with the references by this metric; empty for none.
+        data: the choice of data.
+        own: the samples that `data.own` read; None for simulated patches.
+        metric: psnr, ssim or mae, to also compare the results with the references; "" for none.
     """
     notes = []
     if own is None:
@@ -314,14 +338,18 @@ def pair_of(
     sensor: Sensor,
     output: str | None = None,
 ) -> tuple[Network, Network]:
-    """Return a float network and its INT8 network.
+    """Load the two networks of a comparison: a float network and the INT8 network made from it.
 
     Args:
-        float_network: the float network. If no INT8 one is given: an INT8 network that was
-            quantised in this process, or the name of a shipped pair; the default pair if None.
+        float_network: the float network. If `int8_network` is None, it stands for both: the
+            `Network` that `quantize` returned, or the name of a shipped network; convbeers-s if it
+            is None too.
         int8_network: the INT8 network, or None.
         sensor: the sensor that shipped networks are conditioned on.
-        output: the output to compare, if a network has several.
+        output: the name of the output to compare, if a network has several.
+
+    Returns:
+        The float network and the INT8 network, each with one output.
 
     Raises:
         OptionError: there is no INT8 network, or no such output.

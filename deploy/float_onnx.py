@@ -26,13 +26,18 @@ if TYPE_CHECKING:
 
 
 def float_for(path: Path, name: str, sensor: Sensor, tile_px: int | None = None) -> onnx.ModelProto:
-    """Return a network conditioned on the middle of a sensor profile, as an ONNX model.
+    """Compute the float32 network of one sensor from weights that serve every sensor.
 
     Args:
-        path: the path of its weights.
-        name: the name that it is listed under.
-        sensor: the sensor whose images it is to restore.
-        tile_px: as in `to_onnx`.
+        path: the .safetensors file of sensor-conditioned weights.
+        name: the name of the network in the metadata.
+        sensor: the sensor whose images are to be restored. The middle of each range is used.
+        tile_px: side in pixels of the only image size that the network accepts; None for any
+            number and size of images.
+
+    Raises:
+        ModelError: the weights are for one sensor only.
+        OptionError: the network cannot move the pixels of such a tile into channels.
     """
     weights = read_conditioned(path)
     return banked_to_onnx(weights, sensor.nominal(), about(name, weights, sensor.name), tile_px)
@@ -41,8 +46,16 @@ def float_for(path: Path, name: str, sensor: Sensor, tile_px: int | None = None)
 def to_onnx(
     network: "Weights | ConvBEERS", about: dict[str, str], tile_px: int | None = None
 ) -> onnx.ModelProto:
-    """Convert a plain network to an ONNX model. `tile_px` fixes one square image; None leaves
-    number and size free.
+    """Convert a plain ConvBEERS, one that is not conditioned on a sensor, to an ONNX model.
+
+    Args:
+        network: its weights, or the torch module.
+        about: metadata to write into the model.
+        tile_px: side in pixels of the only image size that the network accepts; None for any
+            number and size of images.
+
+    Raises:
+        OptionError: the network cannot move the pixels of such a tile into channels.
     """
     scale = network.variant.scale
     require_tile(tile_px, scale)
@@ -58,18 +71,23 @@ def to_onnx(
 def banked_to_onnx(
     weights: Weights, sensor: Instrument, about: dict[str, str], tile_px: int | None = None
 ) -> onnx.ModelProto:
-    """Convert a network behind the filter bank of a sensor to an ONNX model. The filters of the
-    bank are its first convolution.
+    """Convert sensor-conditioned weights to the ONNX model of one sensor.
 
-    That convolution returns the image, the planes and the analytic restoration. Another convolution
-    picks the analytic restoration, which the last one reads at one tap, together with the output of
-    the body. The borders of the image are mirrored before the first convolution.
+    The first convolution of the model is the filter bank: filters computed from the sensor's blur
+    and noise (see `model.bank`). It returns the image, four planes of detail and the analytic
+    restoration, which is the image sharpened by a linear filter. Another convolution picks the
+    analytic restoration. The last convolution reads it at one tap, together with the output of the
+    trained layers. The borders of the image are mirrored before the first convolution.
 
     Args:
         weights: the weights of a `BankedConvBEERS`.
         sensor: the sensor whose images are restored.
-        about: metadata.
-        tile_px: side of a fixed square image, or None for any number and size.
+        about: metadata to write into the model.
+        tile_px: side in pixels of the only image size that the network accepts; None for any
+            number and size of images.
+
+    Raises:
+        OptionError: the network cannot move the pixels of such a tile into channels.
     """
     variant = weights.variant
     bank = network_bank(sensor, weights.kernels)
@@ -147,7 +165,13 @@ def _ended(
 
 
 def require_tile(tile_px: int | None, scale: int) -> None:
-    """Raise OptionError if a network at 1 / `scale` of the resolution cannot rearrange a tile."""
+    """Raise OptionError if a tile does not consist of whole squares of pixels.
+
+    Args:
+        tile_px: side of the tile in pixels; None for any size, which passes.
+        scale: side of the squares that the network moves into channels, so that its layers have
+            1 / `scale` of the resolution.
+    """
     if tile_px is not None and tile_px % scale:
         raise OptionError(
             f"`tile` must be a multiple of {scale} px, but it is {tile_px} px. Choose another "
@@ -168,8 +192,13 @@ def _moved(writer: GraphWriter, operator: str, name: str, source: str, scale: in
 
 
 def float_model(path: Path) -> onnx.ModelProto:
-    """Load a float network as ONNX, from an .onnx file or from the .safetensors file of a plain
-    one.
+    """Load a network as ONNX, from an .onnx file or from weights that are for one sensor.
+
+    Args:
+        path: the .onnx file, or the .safetensors file of a plain ConvBEERS.
+
+    Raises:
+        ModelError: the file is not valid, or its weights need a sensor to be conditioned on.
     """
     if path.suffix != ".safetensors":
         return load_onnx(path)
@@ -181,9 +210,14 @@ def about(variant: str, weights: Weights, sensor: str | None = None) -> dict[str
     """Return the metadata of an exported file.
 
     Args:
-        variant: the name that the network is listed under.
-        weights: the weights of the network.
-        sensor: the name of the one that it is conditioned on; that of the recipe if None.
+        variant: the name of the network.
+        weights: the weights of the network, with the recipe of their training.
+        sensor: the name of the sensor that the network is conditioned on; None for the sensor that
+            the recipe names.
+
+    Returns:
+        The names of the network, its sensor and its reference, and the calibrated interval of its
+        pixels if the weights have one, by metadata key.
     """
     recipe = weights.recipe
     interval = {INTERVAL: weights.interval} if weights.interval else {}

@@ -59,22 +59,29 @@ NetworkLike = Union["Network", onnx.ModelProto, "torch.nn.Module", str, os.PathL
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Network:
-    """An ONNX network and its origin.
+    """One ONNX network for image restoration, in float32 or INT8, and its origin.
 
-    `Network.load` accepts any kind of network.
+    `Network.load` makes one from a file, a shipped name, an ONNX model or a torch module. Call the
+    instance to run it on images. The filters of a sensor-conditioned network are computed from the
+    blur and noise of one sensor. "In this process" below means that `quantize` was called in the
+    same Python process, in contrast to a network that was read from a file.
 
     Attributes:
-        model: the network.
-        name: the stem of its file, or the name that it is shipped under.
-        path: the file that holds it; None if it is only in memory.
-        origin: the float network that it was quantised from, if that was done here.
-        layers: if it was quantised here, a row for each replaced operator and each integer layer.
-        quantised: its integer core and the graph that it was rounded from, if it was quantised here
-            by itself.
-        file_sha256: the SHA-256 of the file as it was read; empty if it is only in memory.
-        weights: if it is conditioned on its sensor, the weights that it was made from.
-        profile: the sensor that such a network is conditioned on.
-        table: the report of `quantize`.
+        model: the ONNX model.
+        name: the stem of the network's file, the name that it is shipped under, or the name of its
+            ONNX graph or torch class.
+        path: the file that the network was read from; None if the network was computed for a sensor
+            or is only in memory.
+        origin: the float network that this INT8 network was quantised from in this process, or
+            None.
+        layers: one row for each replaced operator and each integer layer, if the network was
+            quantised in this process; otherwise empty.
+        quantized: the integers and the float graph that they were rounded from, if the network was
+            quantised in this process and is not sensor-conditioned; otherwise None.
+        file_sha256: the SHA-256 of the file's bytes; empty if the network was not read from a file.
+        weights: the weights that a sensor-conditioned network was computed from; None for another.
+        profile: the sensor that a sensor-conditioned network is for; None for another.
+        table: the report of `quantize`; None if the network does not come from `quantize`.
 
     Examples:
         >>> bd.Network.load("convbeers-s-int8").precision
@@ -106,18 +113,21 @@ class Network:
         module.
 
         Args:
-            network: the network. A shipped name ends in -int8 for INT8. A `Network` is returned as
-                it is. None is convbeers-s-int8.
-            sensor: the sensor that a shipped network is conditioned on: a `Sensor`, a name or a
-                .toml file.
-            int8: the precision of a conditioned network; None leaves it to the name.
-            example: shape (N, C, H, W) of an image that a torch module accepts; number and size
-                stay free.
-            to_run: True if a runtime may open the network; False if only the nodes of a file are
-                inspected, whoever defines them.
+            network: the network. A shipped name ends in -int8 for INT8. A `Network` is returned
+                unchanged. None stands for the shipped convbeers-s-int8.
+            sensor: the sensor whose images are to be restored: a `Sensor`, a name or a .toml file.
+                Only shipped networks and weights of `train --conditioned` read it, because
+                their filters are computed from it. By default the sensor is unknown.
+            int8: True for INT8 and False for float32 in a network that `sensor` conditions; None
+                to decide by the suffix -int8 of its name. Other networks ignore it.
+            example: shape (N, C, H, W) of an input that a torch module accepts. The exported
+                network accepts any N, H and W.
+            to_run: True if onnxruntime will run the network; False to inspect only the nodes of an
+                .onnx file, which may then be operators that onnxruntime does not know.
 
         Raises:
-            ModelError: there is no such network, or it is one that no runtime may open.
+            ModelError: no file or shipped network has this name, the file is not a valid network,
+                `network` is of an unsupported type, or torch cannot export the module.
             MissingExtraError: `network` is a torch module, and torch is not installed to export it.
         """
         if isinstance(network, Network):
@@ -143,31 +153,37 @@ class Network:
 
     @classmethod
     def for_sensor(cls, weights: Conditioned, sensor: Sensor, *, int8: bool) -> "Network":
-        """Build the network that sensor-conditioned weights give for one sensor.
+        """Compute the network of one sensor from weights that serve every sensor.
 
         Args:
-            weights: the sensor-conditioned weights.
+            weights: the sensor-conditioned weights: their first filters are computed from the
+                sensor's blur and noise.
             sensor: the sensor profile. If a value is a range, its middle is used.
             int8: True for the INT8 network, False for float32.
 
         Returns:
-            The network for this sensor alone.
+            The network, whose filters suit this sensor only.
 
         Raises:
-            ModelError: INT8 is requested, and the weights have no INT8 file.
+            ModelError: INT8 is requested for weights that are not shipped, so that there is no INT8
+                file.
         """
         name = f"{weights.name}{INT8}" if int8 else weights.name
         return cls(weights.model(sensor, int8), name, weights=weights, profile=sensor)
 
     def with_output(self, name: str | None) -> "Network":
-        """Return the network with only one of its outputs.
+        """Return the network reduced to one of its outputs.
 
         Args:
-            name: the name of the output; None for the only one.
+            name: the name of the output to retain; None if the network has only one.
+
+        Returns:
+            A copy with this output; the network itself if `name` is None.
 
         Raises:
-            ModelError: there are several outputs and no name, or several inputs.
-            OptionError: there is no such output.
+            ModelError: the network has several outputs and `name` is None, or it has several
+                inputs.
+            OptionError: the network has no output of this name.
         """
         model = self.model if name is None else with_one_output(self.model, name, self.label)
         weights = {tensor.name for tensor in model.graph.initializer}
@@ -178,11 +194,12 @@ class Network:
 
     @cached_property
     def exposures(self) -> Mapping[int, "Network"]:
-        """The network conditioned on the sensor at higher gain, by the factor of the gain, which is
-        above 1.
+        """The networks for dark pixels, each under its exposure factor, an integer above 1.
 
-        Empty if the network is not conditioned on its sensor, or if the sensor's noise allows no
-        factor.
+        An image multiplied by a factor looks like one of a sensor with that factor of gain, so each
+        network is conditioned on such a sensor. `restore` multiplies dark pixels, runs the network
+        of the factor, and divides the result. The mapping is empty if the network is not
+        conditioned on a sensor, or if the sensor's noise allows no factor.
         """
         if self.weights is None or self.profile is None:
             return {}
@@ -194,26 +211,30 @@ class Network:
         }
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the network as an ONNX file, atomically."""
+        """Write the network as an ONNX file, atomically, and return the path of the file."""
         save_onnx(self.model, Path(path))
         return Path(path)
 
     def core(
         self, board: TargetProfile | str = DEFAULT_TARGET, tile: int | None = None
     ) -> "Network":
-        """Return the part of an INT8 network that the DPU or NPU computes, in the encoding that a
-        board's tools read.
+        """Return the integer core of an INT8 network, in the encoding that a board's tools read.
+
+        The core is the part that the DPU or NPU computes. The steps before and after it, such as
+        the encoding of pixels as int8, stay on the board's processor.
 
         Args:
-            board: the board whose tools read the file. Those of an NPU read VINT8, of one tile.
-            tile: side in pixels of the image that it is fixed to; the network's own, or any, if
-                None.
+            board: the board whose tools read the file: QDQ ONNX for a DPU, VINT8 for an NPU.
+            tile: side in pixels of the only tile size that the core accepts. None retains the size
+                that the network is fixed to, or any size if it is not fixed to one.
+
+        Returns:
+            A network in memory that reads and writes the core's tensors instead of images.
 
         Raises:
-            ModelError: the network is float, or INT8 that was not quantised under the DPU's rules
-                here.
-            OptionError: the board has an NPU and no tile is given, or the network cannot rearrange
-                the tile.
+            ModelError: the network is float, or was not made by `quantize`.
+            OptionError: the board has an NPU and the tile size is not fixed, or the tile is not a
+                multiple of the squares of pixels that the network moves into channels.
         """
         core = read_core(self.model)
         side_px = tile or fixed_tile_px(self.model)
@@ -222,7 +243,11 @@ class Network:
         return Network(write(core, metadata(self.model), side_px), f"{self.name}-core")
 
     def __call__(self, images: Any) -> np.ndarray:
-        """Run the network on images (N, C, H, W), in its own units, and return (N, C', H', W')."""
+        """Run the network in onnxruntime on images (N, C, H, W) and return (N, C', H', W').
+
+        Values are float32 in the range that the network was trained on: [0, 1] of full scale for
+        the shipped networks.
+        """
         return result_of(self._session, np.ascontiguousarray(images, np.float32))
 
     @cached_property
@@ -231,17 +256,24 @@ class Network:
 
     @property
     def input_ranges(self) -> Ranges:
-        """(low, high) of each channel that an INT8 network reads; empty if all are in [0, 1]."""
+        """The (low, high) of the values in each input channel, for which INT8 was calibrated.
+
+        The tuple is empty if all channels are in [0, 1], and for a network that `quantize` did not
+        make.
+        """
         if CORE not in metadata(self.model):
             return ()
         return read_core(self.model).host_part.input_ranges
 
     @property
     def stated_ranges(self) -> Ranges:
-        """The ranges onto which 0 to full scale of an image is mapped; empty for [0, 1].
+        """The (low, high) of each input channel onto which pixels from 0 to full scale are mapped.
+
+        The tuple is empty if the network reads pixels as [0, 1] of full scale.
 
         Raises:
-            ModelError: ranges of samples, which need not reach as far as full scale.
+            ModelError: the ranges were found in the calibration samples rather than stated by the
+                user. Samples need not reach full scale, so the mapping is unknown.
         """
         ranges = self.input_ranges
         if ranges and FROM_SAMPLES in metadata(self.model).get(KEY, FROM_SAMPLES):
@@ -259,33 +291,35 @@ class Network:
 
     @cached_property
     def tiling(self) -> Tiling:
-        """The tiling geometry: halo, alignment, scale, bands in and out.
+        """The geometry by which large images are cut into tiles for this network.
+
+        It states the halo (context pixels around a tile, later discarded), the multiple of pixels
+        on which tiles begin, the enlargement, and the numbers of bands read and returned.
 
         Raises:
-            ModelError: the network cannot be tiled.
+            ModelError: the network cannot be tiled, for example because an operator reads the whole
+                image.
         """
         return tiling_of(self.model, self.label)
 
     @property
     def sensor(self) -> str:
-        """The name of the sensor that it is conditioned on or made for; empty if the file names
-        none.
-        """
+        """The name of the network's sensor in the file's metadata; empty if the file names none."""
         return metadata(self.model).get("sensor", "")
 
     @cached_property
     def sha256(self) -> str:
-        """SHA-256 of the file that was read, or of the network's bytes if it is in memory alone."""
+        """SHA-256 in hexadecimal of the file that was read, or of the ONNX model without a file."""
         return self.file_sha256 or hashlib.sha256(self.model.SerializeToString()).hexdigest()
 
     @property
     def input(self) -> Input:
-        """The network as an input of results: its name and digest."""
+        """The file name and SHA-256 by which a results document lists the network."""
         return Input(self.path.name if self.path else f"{self.name}.onnx", self.sha256)
 
     @property
     def label(self) -> str:
-        """The name that messages use."""
+        """The name of the network in messages: its path, or its name if there is no file."""
         return str(self.path or self.name)
 
     def __eq__(self, other: object) -> bool:
@@ -306,10 +340,10 @@ class Network:
 
 
 def other_precision(network: Network) -> Network | None:
-    """Return a shipped network of the same variant in the other precision, or None.
+    """Return the shipped network of the same architecture in the other precision, to compare times.
 
-    Its weights may be others. Time depends only on the shapes, so the weights of any sensor will
-    do.
+    Its sensor is the default one, because times depend only on the shapes of the layers. Return
+    None if the architecture that the file's metadata names is not shipped.
     """
     variant = metadata(network.model).get("variant", "")
     if variant not in shipped_names():
@@ -318,7 +352,19 @@ def other_precision(network: Network) -> Network | None:
 
 
 def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
-    """Export a torch module to ONNX, for any number and size of images."""
+    """Export a torch module to ONNX, for any number and size of images.
+
+    Args:
+        module: the torch.nn.Module. Its training mode is restored afterwards.
+        example: shape (N, C, H, W) of an input that the module accepts.
+
+    Returns:
+        The ONNX model, with the input `image` and the output `restored`.
+
+    Raises:
+        ModelError: `module` is not a torch module, or torch cannot export it.
+        MissingExtraError: torch is not installed.
+    """
     if not hasattr(module, "state_dict"):
         raise ModelError(
             "`network` must be a Network, a ModelProto, a torch.nn.Module, a file or a shipped "

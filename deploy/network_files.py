@@ -41,8 +41,14 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Conditioned:
-    """Weights of a network that is conditioned on its sensor, and the name that it is listed
-    under.
+    """A weights file from which the network of any sensor can be computed.
+
+    Such a network is conditioned on its sensor: the filters of its first layer, its filter bank,
+    are computed from the sensor's blur and noise, and the trained weights behind them stay.
+
+    Attributes:
+        name: the name of the shipped network, or the stem of the file.
+        weights: the .safetensors file.
     """
 
     name: str
@@ -50,11 +56,20 @@ class Conditioned:
 
     @property
     def kernels(self) -> Kernels:
-        """The kernels of its filter banks."""
+        """The method by which the filters of the first layer are reduced to 7 x 7 pixels."""
         return read_conditioned(self.weights).kernels
 
     def model(self, sensor: Sensor, int8: bool) -> onnx.ModelProto:
-        """Return the network for a sensor, in float32 or in INT8."""
+        """Compute the ONNX model for a sensor.
+
+        Args:
+            sensor: the sensor, of which the middle of each range is used.
+            int8: True for INT8, False for float32.
+
+        Raises:
+            ModelError: INT8 is requested for weights that are not shipped. Only a shipped network
+                has a known INT8 file.
+        """
         if not int8:
             return float_for(self.weights, self.name, sensor)
         shipped = SHIPPED / f"{self.name}{INT8}.onnx"
@@ -68,11 +83,14 @@ class Conditioned:
 
 
 def conditioned(path: Path) -> Conditioned | None:
-    """Return the sensor-conditioned weights of a shipped name or a file.
+    """Find the sensor-conditioned weights that a shipped name or a file stands for.
+
+    Args:
+        path: the name of a shipped network, with or without the suffix -int8, or a file.
 
     Returns:
-        None if the path is neither the name of a shipped network nor a .safetensors file of
-        sensor-conditioned weights.
+        The weights; None if the path is neither the name of a shipped network nor a .safetensors
+        file of sensor-conditioned weights.
     """
     if _is_shipped(path):
         name = path.name.removesuffix(INT8)
@@ -85,7 +103,15 @@ def conditioned(path: Path) -> Conditioned | None:
 
 
 def weights_file(path: Path) -> Path:
-    """Return the path of a file, or of the shipped network of that name. Nothing is read."""
+    """Resolve a name to the file that would be read, for a check that it is not overwritten.
+
+    Args:
+        path: a file, or the name of a shipped network.
+
+    Returns:
+        The shipped .onnx (INT8) or .safetensors (float32) file for a shipped name, and any other
+        path unchanged. No file is opened.
+    """
     if not _is_shipped(path):
         return path
     return SHIPPED / f"{path.name}.onnx" if path.name.endswith(INT8) else shipped_weights(path.name)
@@ -101,9 +127,13 @@ def _is_shipped(path: Path) -> bool:
 
 
 def require_known(path: Path) -> Path:
-    """Return the path of a network if it can be a file or a shipped name.
+    """Refuse a word that can be neither the file of a network nor the name of a shipped one.
 
-    A path with a suffix is returned without a check that the file exists.
+    Args:
+        path: the word of the user. With a suffix it passes, whether or not the file exists.
+
+    Returns:
+        The same path.
 
     Raises:
         ModelError: the path has no suffix, does not exist, and is not the name of a shipped
@@ -118,11 +148,14 @@ def require_known(path: Path) -> Path:
 
 
 def warn_outside(sensor: Sensor, kernels: Kernels) -> None:
-    """Log a warning for each parameter of a sensor outside the range that a network was trained on.
+    """Log a warning for each parameter of a sensor outside the range that networks were trained on.
+
+    A further warning names an MTF whose curve over the frequencies is another than those that the
+    networks were trained on.
 
     Args:
         sensor: the sensor, of which the middle of each range is used.
-        kernels: the kernels of the network's banks.
+        kernels: the method by which the network's filters are reduced to 7 x 7 pixels.
     """
     instrument = sensor.nominal()
     for sentence in (*sensor_vector(instrument).outside, departure(instrument, kernels)):
@@ -131,9 +164,15 @@ def warn_outside(sensor: Sensor, kernels: Kernels) -> None:
 
 
 def other_sensor(model: onnx.ModelProto, sensor: Sensor) -> str:
-    """Return a warning if a network was made for another sensor than the given one, else "".
+    """Compare a network's recorded sensor with the one that acquires the images.
 
-    An unknown sensor contradicts no network.
+    Args:
+        model: the network, whose metadata may name a sensor.
+        sensor: the sensor of the images. The profile of an unknown sensor contradicts no network.
+
+    Returns:
+        A warning for the user if the network was made for another sensor, or could be conditioned
+        on this one and was not; otherwise "".
     """
     if sensor.name == BLIND:
         return ""
@@ -154,12 +193,22 @@ def other_sensor(model: onnx.ModelProto, sensor: Sensor) -> str:
 def int8_for_sensor(
     model: onnx.ModelProto, sensor: Sensor, more: Mapping[str, str] | None = None
 ) -> onnx.ModelProto:
-    """Return a conditioned INT8 network for another sensor: filters, unit and biases are replaced.
+    """Condition an INT8 network on another sensor.
+
+    Only the filters of the first layer, the biases, and the factor from integers to pixel values
+    are replaced; all other integers stay.
 
     Args:
-        model: for any sensor.
-        sensor: the sensor, of which the middle of each range is used.
-        more: metadata to add.
+        model: an INT8 network that `quantize` made from sensor-conditioned weights, for whichever
+            sensor.
+        sensor: the new sensor, of which the middle of each range is used.
+        more: metadata to write in addition to that of `model`.
+
+    Returns:
+        A new ONNX model, which accepts the same image sizes as `model`.
+
+    Raises:
+        ModelError: `model` cannot be conditioned on a sensor.
     """
     stored = required_conditioned_core(model)
     instrument = sensor.nominal()
@@ -172,8 +221,22 @@ def int8_for_sensor(
 
 
 def int8_for_delta(model: onnx.ModelProto, delta: Path) -> onnx.ModelProto:
-    """Return a conditioned INT8 network for the sensor of a delta, a file written by `export
-    --delta`.
+    """Condition an INT8 network on the sensor of a delta file.
+
+    A delta is a small file, written by `export --delta` to be sent to a satellite. It holds only
+    the data that depend on the sensor: the filters of the first layer, the biases, and the factor
+    from integers to pixel values.
+
+    Args:
+        model: the INT8 network that the delta belongs to.
+        delta: the delta file.
+
+    Returns:
+        A new ONNX model, which accepts the same image sizes as `model`.
+
+    Raises:
+        ModelError: the file cannot be read, is no delta, or belongs to another network; or `model`
+            cannot be conditioned on a sensor.
     """
     try:
         packed = delta.read_bytes()

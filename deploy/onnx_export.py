@@ -27,16 +27,21 @@ logger = logging.getLogger(__name__)
 
 
 def export_float(path: Path, out: Path, sensor: SensorLike | None, tile: int | None) -> None:
-    """Write weights as float ONNX. The user's own weights are compared with torch first.
+    """Write trained weights as a float32 ONNX file.
+
+    Weights that are not shipped are first compared with torch on a random image.
 
     Args:
-        path: the path of the weights.
-        out: file to write.
-        sensor: the sensor that conditioned weights are for; pleiades-degraded if None.
-        tile: side in pixels of the one tile that the input is fixed to; None for any size.
+        path: the .safetensors file of the weights.
+        out: the ONNX file to write.
+        sensor: the sensor to condition the network on, if its weights serve every sensor;
+            pleiades-degraded if None. Weights of one sensor must have None.
+        tile: side in pixels of the only image size that the network accepts; None for any size.
 
     Raises:
-        ModelError: a sensor is given for weights that are for one sensor.
+        ModelError: a sensor is given for weights of one sensor, or the ONNX file would compute
+            other values than torch.
+        OptionError: the network cannot move the pixels of such a tile into channels.
     """
     profile = Sensor.load(sensor or SENSOR) if is_conditioned(path) else None
     if profile is not None:
@@ -66,7 +71,21 @@ def export_float(path: Path, out: Path, sensor: SensorLike | None, tile: int | N
 
 
 def conditioned_int8(path: Path, sensor: SensorLike, delta: Path | None) -> onnx.ModelProto:
-    """Return an INT8 network that is conditioned on a sensor, or on that of a delta."""
+    """Read an INT8 file and condition it on another sensor.
+
+    Args:
+        path: the INT8 file, which `quantize` made from weights that serve every sensor.
+        sensor: the new sensor. It is ignored if there is a delta.
+        delta: a file written by `export --delta` with the filters and biases of its sensor, to use
+            in place of `sensor`; None for none.
+
+    Returns:
+        The ONNX model for the new sensor.
+
+    Raises:
+        ModelError: the INT8 file cannot be conditioned on a sensor, or the delta is damaged or
+            belongs to another network.
+    """
     model = load_onnx(path)
     if delta is not None:
         return int8_for_delta(model, delta)
@@ -83,8 +102,23 @@ def export_int8(
     target: TargetProfile,
     c_file: Path | None = None,
 ) -> None:
-    """Write an INT8 network. Also write its core for a board and its C program, unless their files
-    are None.
+    """Write an INT8 network for onnxruntime, and on request its integer core for a board or as C.
+
+    The integer core is the part that a DPU computes, without the encoding of pixels as int8 and the
+    decoding of the result.
+
+    Args:
+        model: the INT8 network.
+        out: the ONNX file for onnxruntime.
+        tile: side in pixels of the only image size that the files accept; None for the size that
+            `model` is fixed to, or any.
+        core_file: the ONNX file of the core in the board's encoding; None to write none.
+        target: the board.
+        c_file: the C99 program of the core; None to write none.
+
+    Raises:
+        ModelError: `quantize` did not make the network, or sums in C would exceed int32.
+        OptionError: the tile does not suit the network, or a C file or an NPU needs one.
     """
     core = read_core(model)
     side_px = tile or fixed_tile_px(model)
@@ -104,7 +138,18 @@ def export_int8(
 
 
 def delta_files(delta: Path, sensor: SensorLike) -> dict[int, Path]:
-    """Return the deltas to write by factor: the named one at 1, and one for each exposure."""
+    """Name the delta files of a sensor, which hold the filters and biases that suit it.
+
+    `restore` multiplies dark pixels by an exposure factor, and each factor needs filters of its
+    own.
+
+    Args:
+        delta: the file for the factor 1. The other names add the factor, such as NAME-x4.delta.
+        sensor: the sensor, whose noise decides which factors can be used.
+
+    Returns:
+        The path of each delta, by its factor.
+    """
     files = {1: delta}
     for factor in factors_for(Sensor.load(sensor).nominal()):
         if factor > 1:
@@ -113,7 +158,18 @@ def delta_files(delta: Path, sensor: SensorLike) -> dict[int, Path]:
 
 
 def save_delta(model: onnx.ModelProto, sensor: SensorLike, factor: int, delta: Path) -> None:
-    """Write the delta of an INT8 network that is conditioned on a sensor, at one exposure."""
+    """Write the delta of an INT8 network: the filters, biases and factor that suit one sensor.
+
+    Args:
+        model: the INT8 network, conditioned on `sensor`.
+        sensor: the sensor.
+        factor: the exposure factor. Above 1, the delta is that of a sensor with this factor of
+            gain.
+        delta: the file to write.
+
+    Raises:
+        ModelError: the network cannot be conditioned on a sensor.
+    """
     profile = Sensor.load(sensor)
     exposed = model if factor == 1 else int8_for_sensor(model, brightened(profile, factor))
     packed = delta_of_file(exposed)

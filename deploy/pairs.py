@@ -27,14 +27,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Pair:
-    """Two acquisitions of one scene in the same digital numbers. A pair unpacks into both images.
+    """Two simulated images of one scene: by a sensor, and by the better one that is the target.
+
+    `simulate` returns a pair. Unpacking it yields the degraded and the reference image. A digital
+    number (DN) stands for the same radiance in all images.
 
     Attributes:
-        degraded: the image of the sensor, (H, W) uint16.
-        reference: the image of the better sensor, (H, W) uint16.
-        clean: the reference without noise and rounding, (H, W) float32.
-        sensor: the sensor, with a value drawn from each range.
-        profiles: the two sensors that were drawn from.
+        degraded: the image of the sensor, (H, W) uint16, in DN.
+        reference: the image of the better sensor, (H, W) uint16, in DN.
+        clean: the reference without noise and rounding, (H, W) float32, in DN.
+        sensor: the sensor as simulated, with one value drawn from each range of its profile.
+        profiles: the profiles (degraded, reference) from which the values were drawn.
 
     Examples:
         >>> pair = bd.simulate(size=96)
@@ -52,8 +55,13 @@ class Pair:
         return iter((self.degraded, self.reference))
 
     def psnr(self, image: np.ndarray) -> float:
-        """Compute the peak signal-to-noise ratio in dB of an image (H, W) against the reference,
-        over the sensor's full scale.
+        """Compute the PSNR of an image against the reference, with full scale as the peak.
+
+        Args:
+            image: an image (H, W) in DN, for example a restoration of `degraded`.
+
+        Returns:
+            The peak signal-to-noise ratio in dB; higher is more similar.
 
         Raises:
             ImageError: the image has another shape.
@@ -61,8 +69,13 @@ class Pair:
         return psnr_db(self._alike(image), self.reference, self.sensor.max_dn)
 
     def ssim(self, image: np.ndarray) -> float:
-        """Compute the structural similarity of an image (H, W) and the reference, over the sensor's
-        full scale.
+        """Compute the structural similarity of an image and the reference, over full scale.
+
+        Args:
+            image: an image (H, W) in DN, for example a restoration of `degraded`.
+
+        Returns:
+            The mean SSIM; 1 for equal images.
 
         Raises:
             ImageError: the image has another shape, or is smaller than the window of 11 pixels.
@@ -79,8 +92,15 @@ class Pair:
         return pixels
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
-        """Write both images as 12-bit TIFFs that `beers-deploy evaluate --pairs` reads, and a
-        record of how they were simulated.
+        """Write both images as TIFFs that `beers-deploy evaluate --pairs` reads.
+
+        The record of the sensors, recipe.json, is written next to them.
+
+        Args:
+            folder: the folder to write; the images go to its subfolders degraded and reference.
+
+        Returns:
+            The folder.
         """
         out = Path(folder)
         for role, image in (("degraded", self.degraded), ("reference", self.reference)):
@@ -115,17 +135,21 @@ def simulated_pair(
     ratio: int,
     seed: int,
 ) -> Pair:
-    """Simulate the images that two sensors acquire of one scene.
+    """Simulate the images that two sensors acquire of one scene; the work of `simulate`.
 
     Args:
         scene: an image file or its pixels: 8 bits, 16-bit digital numbers, or float radiance in
-            W/m2/sr/um; one is drawn if None.
-        degraded: the sensor. A value is drawn from each of its ranges.
-        reference: the better sensor, which is converted to the digital numbers of `degraded`.
-        size_px: side of the images of a drawn scene.
-        radiance_scale: factor of the scene's radiance.
-        ratio: scene pixels for each pixel.
+            W/m2/sr/um. If None, a synthetic scene is drawn at random.
+        degraded: the sensor. A value is drawn from each range of its profile.
+        reference: the better sensor. Its gain, bits and offset are replaced by those of `degraded`,
+            so that the digital numbers of both images mean the same.
+        size_px: side of the images in pixels; it applies to a drawn scene only.
+        radiance_scale: the factor by which the scene's radiance is multiplied.
+        ratio: the number of scene pixels for each image pixel, along either side.
         seed: the seed of every random draw.
+
+    Returns:
+        The pair of images, with the sensor as it was drawn.
 
     Raises:
         ImageError: the scene cannot be read, or is too small for the margin that the blur needs.

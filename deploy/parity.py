@@ -27,8 +27,14 @@ explains.
 
 
 def torch_network(path: Path, sensor: Instrument | None = None) -> ConvBEERS | OfOneSensor:
-    """Return the torch network that an exported one must agree with, conditioned on a sensor if the
-    weights need one.
+    """Load weights as a torch network, to compare an exported ONNX model with it.
+
+    Args:
+        path: the .safetensors file.
+        sensor: the sensor to condition the network on; None for weights of one sensor only.
+
+    Returns:
+        A torch module that accepts images (N, 1, H, W) in [0, 1].
     """
     network = network_of(read_plain(path) if sensor is None else read_conditioned(path))
     if sensor is not None and isinstance(network, BankedConvBEERS):
@@ -40,13 +46,16 @@ def torch_network(path: Path, sensor: Instrument | None = None) -> ConvBEERS | O
 def require_parity(
     network: ConvBEERS | OfOneSensor, model: Path | onnx.ModelProto, side_px: int
 ) -> float:
-    """Return the largest absolute difference between torch and onnxruntime on one random image, in
-    [0, 1] of full scale.
+    """Check that an exported model computes the same as torch, on one random image.
 
     Args:
         network: the torch network.
-        model: the network that was exported from it.
-        side_px: side of the image, which is rounded up to the next multiple of the network's scale.
+        model: the ONNX model that was exported from it.
+        side_px: side of the image in pixels. It is rounded up to the next multiple of the square of
+            pixels that the network moves into channels.
+
+    Returns:
+        The largest absolute difference of a pixel, as a share of full scale.
 
     Raises:
         ModelError: pixels are not finite, or differ by more than MAX_DIFFERENCE.

@@ -63,7 +63,17 @@ MOST_DIGITS = 9
 
 
 def steps_of(finetune: int | str) -> int | None:
-    """Return the steps of fine-tuning, or None for "auto"."""
+    """Parse the option `finetune` of `quantize`.
+
+    Args:
+        finetune: "auto", or the number of training steps as an int or as digits.
+
+    Returns:
+        The number of steps; None for "auto", which continues while it helps.
+
+    Raises:
+        OptionError: the value is neither.
+    """
     if finetune == "auto":
         return None
     text = str(finetune)
@@ -85,25 +95,31 @@ def quantized(
     adapts: bool = False,
     output: str | None = None,
 ) -> tuple[Network, "Patches | None"]:
-    """Quantise a float network. The INT8 network refers to it as its `origin`.
+    """Quantise a float network of any kind; the work of `quantize`.
 
-    The samples held out from calibration are also returned. They are None for a network that is
-    calibrated over the family of sensors.
+    Sensor-conditioned weights, from which the network of any sensor can be computed, are calibrated
+    on simulated patches of many sensors at once. Any other network is calibrated on its data.
 
     Args:
-        network: float network, a shipped name, or weights that are conditioned on a sensor.
-        data: the data it is calibrated on.
+        network: a float network, a shipped name, or a file of sensor-conditioned weights.
+        data: the data that the network is calibrated on.
         target: the board whose rules apply.
-        finetune: steps that train the integers, or "auto".
+        finetune: the number of training steps of the integers, or "auto" to continue while they
+            help.
         effort: the effort of the search for equalization factors.
-        adapts: replace operators that the DPU lacks.
-        output: name of the output to retain; None for the only one.
+        adapts: True to replace operators that the DPU lacks by ones that it has.
+        output: name of the output to retain; None if the network has only one.
+
+    Returns:
+        The INT8 network, whose `origin` is the float network, and the samples held out from
+        calibration. There are none (None) for sensor-conditioned weights.
 
     Raises:
-        ModelError: the DPU does not compute an operation.
-        OptionError: samples or fine-tuning are given for a network that is conditioned on its
-            sensor.
+        ModelError: the network is INT8 already, or has an operation that the DPU does not compute.
+        OptionError: samples, fine-tuning or `adapts` are given for sensor-conditioned weights, or
+            the target has neither a DPU nor an NPU.
         ImageError: the network does not accept the samples.
+        MissingExtraError: torch is not installed, and fine-tuning needs it.
     """
     weights = conditioned(Path(network)) if isinstance(network, str | os.PathLike) else None
     steps = steps_of(finetune)
@@ -139,18 +155,25 @@ def quantize_alone(
     effort: Effort,
     adapts: bool = False,
 ) -> Network:
-    """Quantise a network for one sensor, with its own calibration.
+    """Quantise a network that is not conditioned on a sensor, or for its present sensor only.
 
     Args:
         origin: the float network.
-        calibration: patches or samples.
+        calibration: the simulated patches or user's samples from which scales are chosen.
         target: the board whose rules apply.
-        steps: the steps of fine-tuning; None to continue while it helps, 0 for none.
+        steps: the number of training steps of the integers; None to continue while they help, 0
+            for none.
         effort: the effort of the search for equalization factors.
-        adapts: replace operators that the DPU lacks. The result is compared with `origin` as it is.
+        adapts: True to replace operators that the DPU lacks by ones that it has. The statistics
+            still compare the result with the unchanged `origin`.
 
     Returns:
-        The INT8 network, with statistics of each layer.
+        The INT8 network, whose `layers` have statistics of each layer.
+
+    Raises:
+        ModelError: the DPU does not compute an operation.
+        OptionError: the target has neither a DPU nor an NPU.
+        MissingExtraError: torch is not installed, and `steps` is not 0.
     """
     shifts = _shifts_of(target)
     tuning = None
@@ -191,17 +214,22 @@ def quantize_conditioned(
 ) -> Network:
     """Quantise a sensor-conditioned network for all sensors of the trained range.
 
+    One calibration serves all of them: the INT8 file can later be conditioned on any other sensor.
+
     Args:
         network: the sensor-conditioned weights.
         origin: the float network for `sensor`.
-        calibration: where images and patches come from. Its patches also give the statistics of
-            each layer.
+        calibration: its images and seed define the calibration patches of many sensors. Its own
+            patches, of one sensor, give the statistics of each layer.
         sensor: the sensor that the result is conditioned on.
         target: the board whose rules apply.
         effort: the effort of the search for equalization factors.
 
     Returns:
-        The INT8 network for `sensor`, with statistics of each layer.
+        The INT8 network for `sensor`, whose `layers` have statistics of each layer.
+
+    Raises:
+        OptionError: the target has neither a DPU nor an NPU.
     """
     images = [] if calibration.images is None else [calibration.images]
     family = family_model(network, images, calibration.seed, _shifts_of(target), effort=effort)
@@ -220,10 +248,10 @@ def _shifts_of(target: TargetProfile) -> Shifts:
 
 
 def differences_of(network: Network, held_out: "Patches") -> GateResult:
-    """Return the differences between INT8 and float for a network that was quantised here.
+    """Measure the differences between an INT8 network and its float network.
 
     Args:
-        network: the INT8 one.
+        network: the INT8 network that `quantized` returned, which knows its float network.
         held_out: the samples held out from calibration.
     """
     assert network.origin is not None  # noqa: S101
@@ -233,14 +261,18 @@ def differences_of(network: Network, held_out: "Patches") -> GateResult:
 def sensitivity_report(
     network: Network, held_out: "Patches", differences: GateResult, prices: Sequence[Row]
 ) -> tuple[list[Row], Report]:
-    """Return the sources of the INT8 error on the samples held out from calibration, as rows and a
-    page.
+    """Analyse which layers and samples cause the INT8 error, as rows and as an HTML page.
 
     Args:
-        network: a network that was quantised here.
-        held_out: the samples.
-        differences: the differences measured on them.
-        prices: the rows of `price_rows`, which the page shows as well.
+        network: the INT8 network that `quantize_alone` returned.
+        held_out: the samples held out from calibration.
+        differences: the differences measured on these samples.
+        prices: the rows of `price_rows`, the loss that each restriction of the DPU's integers adds,
+            which the page shows as well.
+
+    Returns:
+        The rows (the differences, the error of each layer, the worst samples, the sizes of the
+        differences), and the content of the page.
     """
     assert network.origin is not None and network.quantized is not None  # noqa: S101, PT018
     worst = differences.spread.worst(WORST)
@@ -263,10 +295,20 @@ def sensitivity_report(
 
 
 def rounding_of(int8: Path, weights: Path) -> "Rounding":
-    """Return how the INT8 file of a conditioned network rounds its maps.
+    """Read the step sizes by which an INT8 file rounds the results of its layers.
+
+    `train` calls this to imitate INT8 while it trains a sensor-conditioned network further.
+
+    Args:
+        int8: the INT8 file.
+        weights: the .safetensors file that it was quantised from.
+
+    Returns:
+        The step size of each channel of the tensors between the layers, as torch tensors.
 
     Raises:
-        ModelError: it was made from other weights.
+        ModelError: the INT8 file was quantised from other weights, or is not conditioned on a
+            sensor.
     """
     import torch
 
@@ -294,17 +336,22 @@ def family_model(
     passes: Passes = ALL,
     effort: Effort = Effort.normal,
 ) -> onnx.ModelProto:
-    """Quantise a conditioned network over the family of sensors, and return its INT8 file for the
-    middle of the family.
+    """Quantise a sensor-conditioned network with one calibration for the whole family of sensors.
+
+    The family is the range of blurs and noises that such networks are trained on.
 
     Args:
-        network: weights that 'train --conditioned' wrote.
+        network: sensor-conditioned weights, as 'train --conditioned' writes them.
         images: folders of photographs, to which about the same number of drawn scenes is added. If
-            empty, only drawn scenes are used.
+            empty, only scenes drawn at random are used.
         seed: the seed of the patches.
-        shifts: the shift limits of the target.
-        passes: the passes that reduce the error.
+        shifts: the bit shifts that the target's arithmetic allows.
+        passes: the passes that reduce the rounding error; by default all of them.
         effort: the effort of the search for equalization factors.
+
+    Returns:
+        The ONNX model for the sensor in the middle of the family. `int8_for_sensor` makes that of
+        another sensor from it.
     """
     # This loads SciPy, which samples of one's own do without.
     from beers_deploy.model.simulator.procedural import load_scenes

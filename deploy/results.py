@@ -36,25 +36,42 @@ SCHEMA_PATH = Path(__file__).parent / "schema" / "results-2.json"
 
 
 class Input(NamedTuple):
-    """A file or a network that figures rest on, by its name and SHA-256."""
+    """A file or a network that figures depend on.
+
+    Attributes:
+        name: the name of the file, or a description such as "samples in memory".
+        sha256: the SHA-256 of its content in hexadecimal.
+    """
 
     name: str
     sha256: str
 
 
 def input_of(path: Path) -> Input:
-    """Return the name and the digest of a file."""
+    """Read a file and return its name and SHA-256, as a results document lists its inputs."""
     return Input(path.name, sha256(path))
 
 
 def inputs_of(*paths: Path | None) -> tuple[Input, ...]:
-    """Return name and digest of each file that exists. Call it before the files are read."""
+    """Return the name and SHA-256 of each file, to detect later that a file was replaced.
+
+    Call this before the files are used, and `require_same` afterwards.
+
+    Args:
+        paths: the files. None, folders and files that do not exist are left out.
+    """
     return tuple(input_of(path) for path in paths if path is not None and path.is_file())
 
 
 def require_same(before: Iterable[Input], *paths: Path | None) -> None:
-    """Raise OptionError if a file was replaced since `inputs_of`, because the digest would be that
-    of another file.
+    """Refuse results whose input files changed while they were computed.
+
+    Args:
+        before: what `inputs_of` returned for the same files before they were used.
+        paths: the files, in the same order.
+
+    Raises:
+        OptionError: a file has another name or content than before.
     """
     # A file that is gone meanwhile has no digest, so the lists may differ in length.
     for then, now in zip(before, inputs_of(*paths), strict=False):
@@ -67,21 +84,25 @@ def require_same(before: Iterable[Input], *paths: Path | None) -> None:
 
 @dataclass(frozen=True, repr=False)
 class Table:
-    """The figures of a verb, its checks, and their origins.
+    """The result of a command of this package: its figures and checks, with their origins.
 
-    A table is true if all its checks passed. Iterating over it yields its rows.
+    A verb is a function that is also a command, such as `bench`. A figure is a number with its
+    unit, its mode (measured, predicted, published or unavailable), its interval and its source.
+    A table is true if all its checks passed, or if it has none. Iterating over it yields its rows.
 
     Attributes:
-        command: the verb.
-        arguments: the arguments of the verb.
-        inputs: files and networks that the figures rest on.
-        rows: the figures, each with its value, unit, mode, interval and source.
-        checks: the checks of the verb; the command exits with 1 if one of them failed.
-        notes: sentences that a reader must know.
-        title: heading of the whole.
-        headings: the heading of each table of rows, if its name is not clear enough by itself.
-        captions: a sentence to be shown after a table, by its heading.
-        details: tables, figures and words that are shown only in detail, by their names.
+        command: the name of the verb.
+        arguments: the value of each argument of the verb, by the name of the argument.
+        inputs: the files and networks that the figures depend on. A path is read when the table is
+            written as a document.
+        rows: the rows. Each belongs to a table that it names, and has figures and texts by column.
+        checks: comparisons of a value with its limit; the command exits with 1 if one of them
+            failed.
+        notes: sentences shown below the tables, for example on the limits of the figures.
+        title: the heading above all tables.
+        headings: the heading to show in place of a table's name, by that name.
+        captions: a sentence to show below a table, by the table's heading.
+        details: the names of tables and of columns that are shown only on request.
 
     Examples:
         >>> table = bd.check("convbeers-xs-int8", target="vck190")
@@ -104,12 +125,12 @@ class Table:
 
     @property
     def failed(self) -> tuple[Check, ...]:
-        """The checks that did not pass."""
+        """The checks whose value is beyond the limit."""
         return tuple(check for check in self.checks if not check.passed)
 
     @property
     def verdict(self) -> str:
-        """A sentence that states whether the checks passed; empty without checks."""
+        """A sentence that states whether all checks passed, and which failed; "" without checks."""
         if not self.checks:
             return ""
         if self.failed:
@@ -119,10 +140,13 @@ class Table:
         return f"{self.command} passed, all {len(self.checks)} checks"
 
     def shown(self, details: bool = False) -> dict[str, list[Row]]:
-        """Return the rows of each table that is shown, by its heading.
+        """Select the rows and columns that a reader sees, grouped by table.
 
         Args:
-            details: if True, include tables, figures and words that are shown only in detail.
+            details: True to include the tables and columns that `Table.details` names.
+
+        Returns:
+            The rows of each table that is not empty, by the table's heading.
         """
         tables: dict[str, list[Row]] = {}
         for name, rows in by_table(self.rows).items():
@@ -138,11 +162,11 @@ class Table:
         return {heading: rows for heading, rows in tables.items() if rows}
 
     def print(self, console: Console | None = None, details: bool = False) -> None:
-        """Print the tables, checks and notes.
+        """Print the title, the tables, and below them the checks, notes and verdict.
 
         Args:
-            console: the console of rich; standard output if None.
-            details: if True, include tables, figures and words that are shown only in detail.
+            console: a `rich.console.Console` to print to; None for standard output.
+            details: True to include the tables and columns that `Table.details` names.
         """
         console = console or default_console()
         if self.title:
@@ -160,12 +184,16 @@ class Table:
 
     @property
     def sentences(self) -> list[str]:
-        """The sentences below the tables: each check with its outcome, the notes, the verdict."""
+        """The lines below the tables: each check with "ok" or "FAILED", the notes, the verdict."""
         checks = [f"{'ok    ' if check.passed else 'FAILED'} {check}" for check in self.checks]
         return [*checks, *self.notes, *filter(None, (self.verdict,))]
 
     def to_dict(self) -> dict[str, object]:
-        """Return the table in the schema of results documents."""
+        """Return the results document: the table, its inputs' SHA-256, and the machine.
+
+        The keys are those of the JSON schema deploy/schema/results-2.json. All values are of types
+        that JSON has. Input files that are still paths are read here.
+        """
         inputs = [item if isinstance(item, Input) else input_of(item) for item in self.inputs]
         checks = [check.to_json() for check in self.checks]
         verdict = "passed" if self else "failed"
@@ -193,16 +221,16 @@ class Table:
         return {key: _encodable(value) for key, value in document.items()}
 
     def to_json(self) -> str:
-        """Return `to_dict` as JSON."""
+        """Return the document of `to_dict` as JSON text."""
         return json.dumps(self.to_dict(), indent=1) + "\n"
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the table as a JSON file, atomically, and return its path."""
+        """Write the document of `to_dict` as a JSON file, atomically, and return its path."""
         write_text(Path(path), self.to_json())
         return Path(path)
 
     def to_markdown(self) -> str:
-        """Return the title, the tables, checks, notes and the verdict as Markdown."""
+        """Render the title, the tables, checks, notes and the verdict as Markdown text."""
         lines = [f"# {markdown_text(self.title)}", ""] if self.title else []
         for heading, rows in self.shown().items():
             lines += [f"## {markdown_text(heading)}", "", *markdown_table(rows), ""]
@@ -212,12 +240,12 @@ class Table:
         return "\n".join(lines).rstrip() + "\n"
 
     def to_pandas(self, tidy: bool = False) -> "pd.DataFrame":
-        """Return the figures as a pandas DataFrame.
+        """Convert the rows to a pandas DataFrame, for plots and further computation.
 
         Args:
-            tidy: if True, one line for each figure with value, unit, mode, low, high and source.
-                Otherwise one line for each row, with a column for each figure and each text;
-                `attrs["units"]` has the units.
+            tidy: True for one line for each figure, with the columns value, unit, mode, low, high
+                and source. False for one line for each row, with a column for each figure and each
+                text; `DataFrame.attrs["units"]` then has the unit of each figure.
 
         Raises:
             MissingExtraError: pandas is not installed.
@@ -225,15 +253,21 @@ class Table:
         return tidy_frame(self.rows) if tidy else wide_frame(self.rows)
 
     def plot(self, figure: str | None = None, ax: "Axes | None" = None) -> "Axes":
-        """Draw bars of one figure of every row that has it, with its interval, coloured by mode.
+        """Draw a bar chart of one figure of all rows, with matplotlib.
+
+        A bar has the colour of its mode (measured, predicted or published), and an error bar if it
+        has an interval. Rows without the figure are left out.
 
         Args:
-            figure: its name; the first that any row has if None.
-            ax: axes of matplotlib to draw on; new ones if None.
+            figure: the name of the figure, a column of the table; None for the first one.
+            ax: the axes to draw on; None for new ones.
+
+        Returns:
+            The axes with the chart.
 
         Raises:
             MissingExtraError: matplotlib is not installed.
-            OptionError: no row has such a figure.
+            OptionError: no row has a figure of this name.
         """
         return bars(self.rows, figure, ax)
 
@@ -270,8 +304,13 @@ class Table:
 
 
 def host() -> dict[str, object]:
-    """Return a description of the machine that measured the figures, with None for unknown
-    values.
+    """Describe this machine, for the documents of figures that were measured on it.
+
+    Returns:
+        The operating system, the architecture and name of the processor, Python's version, the
+        number of logical CPUs, the memory in GB, the load average over a minute, and what tests in
+        this process found about the runtimes' kernels. A load that the system does not count is
+        None.
     """
     import psutil
 

@@ -23,7 +23,9 @@ from beers_deploy.results import Table
 
 
 def boards() -> Table:
-    """Return the shipped boards with a DPU: their configurations, and the sources of their rules.
+    """List the boards with a DPU that this package has profiles of, one row for each.
+
+    The texts of a row are the names of the DPU's configurations, and a description.
 
     Examples:
         >>> bd.boards().to_pandas().index.to_list()
@@ -40,7 +42,11 @@ def boards() -> Table:
 
 
 def sensors() -> Table:
-    """Return the shipped sensors: contrast at Nyquist, SNR, bits, and a description.
+    """List the sensor profiles of this package, one row for each.
+
+    The figures of a row are the contrast (MTF) at the Nyquist frequency, the SNR at the second
+    radiance of the profile, and the number of bits of a pixel. If a profile states a range, the
+    figure is its middle, and the interval is the range.
 
     Examples:
         >>> bd.sensors().to_pandas().index.to_list()[2:]
@@ -70,7 +76,9 @@ def _figure(constant: Constant, unit: str) -> Figure:
 
 
 def networks() -> Table:
-    """Return the shipped networks, each in float32 and in INT8.
+    """List the networks that are installed with this package, by the name that commands accept.
+
+    Each has a row for float32 and one for INT8, whose name ends in -int8.
 
     Examples:
         >>> "convbeers-s-int8" in bd.networks().to_pandas().index
@@ -84,7 +92,7 @@ def networks() -> Table:
 
 
 def list_of_profiles() -> Table:
-    """Return all shipped profiles by kind."""
+    """List the shipped sensors, scenes and boards: a table of each kind, with a description."""
     kinds = {
         "sensors": {name: Sensor.load(name).description for name in sensor_names()},
         "scenes": {name: SceneCall.load(name).description for name in scene_names()},
@@ -97,13 +105,30 @@ def list_of_profiles() -> Table:
 
 
 def text_of_profile(name: str) -> str:
-    """Return the TOML text of a shipped sensor, scene or board, which is a valid file by itself."""
+    """Return the TOML text of a profile, which a user can save and edit as a profile of their own.
+
+    Args:
+        name: the name of a shipped sensor, scene or board, or a .toml file.
+
+    Raises:
+        OptionError: there is no profile of this name.
+    """
     kind, _ = _profile(name)
     return profile_path(kind, name).read_text(encoding="utf-8")
 
 
 def table_of_profile(name: str) -> Table:
-    """Return every constant of a sensor, a scene or a board."""
+    """List every constant of a sensor, a scene or a board, with its status and its source.
+
+    Args:
+        name: the name of a shipped profile, or a .toml file.
+
+    Returns:
+        A table with a row for each key of the file, whose texts are value, status and source.
+
+    Raises:
+        OptionError: there is no profile of this name.
+    """
     _, table = _profile(name)
     return table
 
@@ -152,7 +177,7 @@ def _sensor_rows(sensor: Sensor) -> list[Row]:
 
 
 def _response(sensor: Sensor) -> list[Row]:
-    """Return a table's numbers, or the components of a point-spread function."""
+    """Return the rows of a sensor's MTF: a measured table, or parts of a point-spread function."""
     response = sensor.response
     words = {"status": sensor.mtf_nyquist.status, "source": sensor.mtf_nyquist.source}
     if response is None:

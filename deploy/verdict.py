@@ -68,7 +68,13 @@ REMAKE = "Make it again with 'gate --json' and these arguments."
 
 
 def read_document(path: Path) -> dict[str, object]:
-    """Read a results document, and check it against the schema.
+    """Read the JSON document that a command wrote with `--json`, and check it against the schema.
+
+    Args:
+        path: the path of the document.
+
+    Returns:
+        The document, with the keys that `Table.to_dict` writes.
 
     Raises:
         OptionError: the file cannot be read, is not JSON, or does not follow the schema.
@@ -92,14 +98,15 @@ def read_document(path: Path) -> dict[str, object]:
 
 @dataclass(frozen=True)
 class Baseline:
-    """The figures of an earlier gate that passed.
+    """The figures of an earlier gate that passed, which the differences now may not exceed.
 
     Attributes:
-        path: the path of its document.
-        mae: over full scale.
-        psnr_float_db: the PSNR of the float network against the references; NaN without any.
-        digests: SHA-256 of its inputs, by name; two networks may have one file name.
-        checks: names of its checks.
+        path: the path of the earlier gate's results document.
+        mae: its mean absolute difference of INT8 from float, as a share of full scale.
+        psnr_float_db: the PSNR of the float network against the references in dB; NaN if the
+            samples have no references.
+        digests: the SHA-256 of its inputs, by name; two networks may have one file name.
+        checks: the names of the checks that it made.
     """
 
     path: Path
@@ -111,14 +118,13 @@ class Baseline:
     def require_same(
         self, float_sha256: str, psnr_float_db: float, inputs: Iterable[Input]
     ) -> None:
-        """Raise OptionError if the baseline is of another float network or sensor, or of other
-        images or samples.
+        """Raise OptionError if the baseline's float network, sensor, images or samples were others.
 
         Args:
-            float_sha256: digest of the float network that is checked now.
-            psnr_float_db: its PSNR, by which the network is recognised if it was saved again as
-                another file.
-            inputs: all other inputs of the comparison, without networks.
+            float_sha256: SHA-256 of the float network that is compared now.
+            psnr_float_db: PSNR of this network against the references in dB. The network is
+                recognised by it if it was saved again as another file.
+            inputs: all inputs of the comparison now, except the two networks.
         """
         # A network that was saved again has another digest, but the same PSNR.
         same_psnr = abs(psnr_float_db - self.psnr_float_db) < SAME_DB
@@ -142,7 +148,8 @@ def read_baseline(path: Path, arguments: Mapping[str, Any]) -> Baseline:
 
     Args:
         path: the path of the document.
-        arguments: the arguments of the gate that is to be compared with it.
+        arguments: the arguments of the gate that runs now, by name. Those that define the patches
+            must be equal in the document.
 
     Raises:
         OptionError: the file is not a results document, or is one of another command, of a gate
@@ -192,17 +199,19 @@ def _plain(name: str, value: object) -> str:
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Verdict(Table):
-    """A comparison, and every check of a gate. It is true if all of them passed."""
+    """The result of `gate`: the figures of `comparison`, and a check for each limit. It is true if
+    all checks passed.
+    """
 
     comparison: Comparison
 
     def raise_if_failed(self) -> None:
-        """Raise GateFailedError if a limit is exceeded. Use this in a test."""
+        """Raise GateFailedError if a check failed. Call this in a test of your own."""
         if not self:
             raise GateFailedError(self.verdict)
 
     def to_junit(self) -> str:
-        """Return the verdict as JUnit XML: a test case for each check."""
+        """Return the verdict as JUnit XML, which CI servers read: a test case for each check."""
         return junit_text(f"INT8 gate of {self.comparison.int8.name}", self.checks)
 
     @property
@@ -220,22 +229,23 @@ class Verdict(Table):
 
 
 class GateFailedError(AssertionError):
-    """An INT8 network exceeds a limit. This is not bad input, so it is not a `BeersError`."""
+    """The error of `Verdict.raise_if_failed`. It is not bad input, so it is no `BeersError`."""
 
 
 def baseline_for(
     path: Any, arguments: Mapping[str, object], limits: Limits, metric: str | None
 ) -> Baseline | None:
-    """Read the baseline that a gate compares with: the document of an earlier `gate --json`.
+    """Read the baseline of a gate, if one is given, and check that its limits have what they need.
 
     Args:
-        path: the path of the document; None for no baseline.
-        arguments: the arguments of this gate. The baseline must have judged the same patches.
-        limits: the limits of this gate; some need a baseline or a metric.
-        metric: by which results are compared with references; None for no metric.
+        path: the path of the document of an earlier `gate --json`; None for no baseline.
+        arguments: the arguments of the gate that runs now, by name.
+        limits: the limits of this gate. Its `mae_growth` needs a baseline, its `metric_loss` a
+            metric.
+        metric: the metric by which results are compared with references; None for no metric.
 
     Returns:
-        None if no path is given.
+        The baseline; None if no path is given.
 
     Raises:
         OptionError: a limit needs a baseline or a metric and none is given, or the baseline is of
@@ -255,7 +265,9 @@ def baseline_for(
 
 
 def require_references(own: OwnSamples | None, limits: Limits, metric: str | None) -> None:
-    """Raise OptionError if a metric or a limit needs references, and the samples have none."""
+    """Raise OptionError if the metric or the limit `psnr_drop_db` needs references, and the user's
+    samples have none. Simulated patches (`own` is None) have references.
+    """
     purpose = "`metric`" if metric else ""
     if limits.psnr_drop_db is not None:
         purpose = "the limit 'psnr_drop_db'"
@@ -273,14 +285,14 @@ def judged(
     target: TargetProfile,
     own: OwnSamples | None,
 ) -> Verdict:
-    """Return the verdict on a comparison.
+    """Check a comparison against the limits, and the INT8 file against the board's rules.
 
     Args:
         comparison: the comparison of the float and the INT8 network.
         limits: the limits of the differences.
         baseline: the baseline of an earlier gate, or None.
         target: the board whose rules apply to the INT8 file.
-        own: the user's samples that both were compared on; None for simulated patches.
+        own: the user's samples of the comparison; None for simulated patches.
 
     Raises:
         OptionError: the samples have too little contrast for the limits, or the baseline is of
@@ -342,13 +354,13 @@ def _mae_note(result: GateResult, limits: Limits, checks: Sequence[Check]) -> li
 def file_checks(
     float_model: onnx.ModelProto, int8: Network, target: TargetProfile, must_describe: bool = False
 ) -> list[Check]:
-    """Check the INT8 file itself: the rules of the target's DPU or NPU, then its structure.
+    """Check the INT8 file itself: the rules of the board's DPU or NPU, then its structure.
 
     Args:
         float_model: the network that the file was quantised from, whose ReLUs the file must have.
-        int8: the file.
-        target: the board. One with neither DPU nor NPU has no rules.
-        must_describe: True if a file that does not describe its integers fails.
+        int8: the INT8 network.
+        target: the board. The rules are not checked if it has neither a DPU nor an NPU.
+        must_describe: True if a file fails whose metadata do not describe its integers.
     """
     checks = structure_checks(float_model, int8.model, must_describe)
     if not (target.configurations or target.npu):
@@ -359,7 +371,7 @@ def file_checks(
 
 
 def junit_text(title: str, checks: Sequence[Check]) -> str:
-    """Return the verdict as JUnit XML: a test case for each check."""
+    """Write checks as JUnit XML: a test suite named `title` with a test case for each check."""
     faults = {
         check.name: f"found {check.actual}, allowed {check.allowed}"
         for check in checks
@@ -369,7 +381,7 @@ def junit_text(title: str, checks: Sequence[Check]) -> str:
 
 
 def junit_error(title: str, message: str) -> str:
-    """Return JUnit XML with one error: nothing could be judged, and the reason."""
+    """Return the JUnit XML of a gate that stopped with an error, whose message is `message`."""
     return _junit(title, "error", ["gate"], {"gate": printable(message, JUNIT_CHARACTERS)})
 
 

@@ -49,9 +49,16 @@ CONTEXT_SETTINGS = {"help_option_names": ["-h", "--help"]}
 
 @lru_cache
 def command_of(spelling: str) -> Any:
-    """Return the Typer command that a user's word names, such as "characterise".
+    """Build the command that the user names on the command line.
 
-    Raises KeyError if there is no command of that name or spelling.
+    Args:
+        spelling: the name of a command, or another spelling of it such as "characterise".
+
+    Returns:
+        The Click command that Typer makes from the verb.
+
+    Raises:
+        KeyError: there is no command of this name or spelling.
     """
     command = COMMANDS[SPELLINGS.get(spelling, spelling)]
     alone = typer.Typer(
@@ -67,8 +74,10 @@ def command_of(spelling: str) -> Any:
 
 
 class Commands(Mapping[str, Any]):
-    """The commands of Typer by spelling. Each one is made on demand, because making all of them
-    takes a third of the time of `restore --help`.
+    """A read-only mapping from the spelling of each command to the Click command.
+
+    A command is built when it is looked up, because building all of them takes a third of the time
+    of `restore --help`.
     """
 
     def __getitem__(self, spelling: str) -> Any:
@@ -82,8 +91,12 @@ class Commands(Mapping[str, Any]):
 
 
 class Group(TyperGroup):
-    """A group that reserves standard output for the results document if the user asks for it
-    there.
+    """The command `beers-deploy`, which has all others as subcommands.
+
+    With `--json -`, it reserves standard output for the results document.
+
+    Attributes:
+        results_on_stdout: True if the user asks for the results document on standard output.
     """
 
     results_on_stdout = False
@@ -93,14 +106,14 @@ class Group(TyperGroup):
         self.commands = cast(Any, Commands())
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Note whether the results go to standard output."""
+        """Parse the command line as Click does, and set `results_on_stdout`."""
         # After parsing, Click stores the words in an attribute whose name differs between its
         # versions.
         self.results_on_stdout = ("--json", "-") in pairwise(args) or "--json=-" in args
         return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the chosen command. If output was lost, exit with 70 at the end."""
+        """Run the chosen command. Exit with 70 if some of its output could not be written."""
         closed = sys.stdout is None
         with lasting_streams(self.results_on_stdout) as out:
             result = super().invoke(ctx)

@@ -31,11 +31,11 @@ Json = Annotated[
 
 @dataclass(frozen=True)
 class Command:
-    """A verb as a command.
+    """A verb, a public function of this package, described as a command.
 
     Attributes:
         verb: the function.
-        example: words of a command line.
+        example: an example of its arguments on a command line, which the help shows.
     """
 
     verb: Callable[..., Any]
@@ -43,44 +43,51 @@ class Command:
 
     @property
     def name(self) -> str:
-        """The name on the command line."""
+        """The name of the command, which is that of the function."""
         return self.verb.__name__
 
     @cached_property
     def doc(self) -> Docstring:
-        """The docstring, parsed."""
+        """The parsed docstring of the function."""
         return parse(inspect.cleandoc(self.verb.__doc__ or ""), DocstringStyle.GOOGLE)
 
     @property
     def parameters(self) -> list[inspect.Parameter]:
-        """The parameters of the verb that the command has."""
+        """The parameters of the function that the command has as arguments or options.
+
+        Those marked `PythonOnly` are left out.
+        """
         every = parameters_of(self.verb).values()
         return [parameter for parameter in every if marker(parameter, PythonOnly) is None]
 
     @property
     def has_table(self) -> bool:
-        """True if the command writes results documents. All do, except those that return a path."""
+        """True if the command has the option --json: its function does not return a path."""
         return inspect.signature(self.verb).return_annotation is not Path
 
     @property
     def help(self) -> str:
-        """The text above the options: what the verb does."""
+        """The text of the help above the options: the docstring without its sections."""
         # Without a long description the parser leaves an empty line after the short one.
         return (self.doc.description or "").strip()
 
 
 @lru_cache
 def parameters_of(verb: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
-    """Return the parameters of a verb by name."""
+    """Return the parameters of a verb by name, in the order of its signature."""
     return inspect.signature(verb).parameters
 
 
 def generated(command: Command, run: Callable[..., None]) -> Callable[..., None]:
-    """Return a function that Typer turns into a command.
+    """Make a function from a verb that Typer can turn into a command.
 
     Args:
-        command: the verb, and how it is listed.
-        run: is called with the options by name, and with quiet, verbose and json.
+        command: the verb and its docstring.
+        run: the function that runs the verb. It is called with the parsed options as keyword
+            arguments, and with quiet, verbose and, if the command has a table, json.
+
+    Returns:
+        A function whose signature has Typer's annotations, and whose docstring is the help.
     """
 
     def called(**options: Any) -> None:
@@ -144,10 +151,18 @@ def _default(parameter: inspect.Parameter, hint: Any, repeated: bool) -> Any:
 
 
 def read_as(annotation: Any) -> tuple[Any, bool]:
-    """Return the type that the command line reads a parameter as, and whether it may be repeated.
+    """Find the type to which the command line converts the text of a parameter.
 
-    A type that only Python has, such as a mapping of limits, is read as a path or a text, whichever
-    its annotation names first.
+    Args:
+        annotation: the annotation of the parameter. If it is a union with types that only Python
+            has, such as a mapping of limits, its first type for the command line is used.
+
+    Returns:
+        A Literal, bool, int, float, str or Path; and True if the option may be repeated, because
+        the annotation is a sequence of this type.
+
+    Raises:
+        TypeError: the annotation contains no type for the command line.
     """
     parts = list(parts_of(annotation))
     repeated = next((part for part in parts if get_origin(part) is Sequence), None)
@@ -160,7 +175,10 @@ def read_as(annotation: Any) -> tuple[Any, bool]:
 
 
 def spellings_of(parameter: inspect.Parameter) -> list[str]:
-    """Return the spellings of an option. A switch that is on by default is turned off by --no-."""
+    """Return the spellings of an option in Typer's notation, such as ["-o", "--out"].
+
+    A switch that is on by default is spelt "--name/--no-name".
+    """
     name = option_of(parameter.name)
     if parameter.default is True:
         return [f"{name}/--no-{name[2:]}"]
@@ -170,12 +188,12 @@ def spellings_of(parameter: inspect.Parameter) -> list[str]:
 
 
 def option_of(name: str) -> str:
-    """Return the option for a parameter name; `with_` stands for --with."""
+    """Return the option of a parameter name: `max_mae` becomes --max-mae, and `with_` --with."""
     return f"--{name.rstrip('_').replace('_', '-')}"
 
 
 def metavar_of(parameter: inspect.Parameter) -> str:
-    """Return the name of an argument on the command line, in capitals."""
+    """Return the name of a positional argument in the help: that of the parameter in capitals."""
     return parameter.name.upper()
 
 
@@ -200,17 +218,28 @@ PYTHON_SENTENCE = re.compile(r"\s*(?:\bIn Python\b[^.]*\.|; in Python\b[^.;]*)")
 
 
 def text_for_command(text: str, verb: Callable[..., Any]) -> str:
-    """Return the text of a parameter on one line, without what Python alone accepts."""
+    """Convert the docstring text of a parameter to its help text.
+
+    Args:
+        text: the text under Args. Sentences on what only Python accepts are removed.
+        verb: the function, whose parameter names are replaced by options.
+
+    Returns:
+        One line that begins with a capital.
+    """
     words = in_options(PYTHON_SENTENCE.sub("", " ".join(text.split())).strip(), verb)
     return words[:1].upper() + words[1:]
 
 
 def in_options(text: str, verb: Callable[..., Any]) -> str:
-    """Return the text with parameter names replaced by the options of the command line.
+    """Replace parameter names in a text by the options of the command line.
+
+    Messages and docstrings name a parameter in backquotes, as Python has it: `max_mae` becomes
+    --max-mae here, and a positional parameter becomes its name in capitals.
 
     Args:
-        text: a text with parameters in backquotes.
-        verb: the function that has the parameters.
+        text: the text.
+        verb: the function that has the parameters. Other names in backquotes lose the backquotes.
     """
     parameters = parameters_of(verb)
 

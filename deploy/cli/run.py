@@ -38,9 +38,18 @@ def run(
     json: Path | None = None,
     **options: Any,
 ) -> None:
-    """Run a verb, print its result, and exit with 1 if a check failed.
+    """Run a verb as a command, and print its result.
 
-    An error that the user can correct exits with 2, any other with 70.
+    Args:
+        command: the verb.
+        quiet: True to print only errors.
+        verbose: True to print details too, and the traceback of an error.
+        json: the file to write the results document to; "-" for standard output; None for neither.
+        options: the arguments of the verb, None where the user gave none.
+
+    Raises:
+        typer.Exit: the exit code is 1 if a check failed, 2 for an error that the user can correct,
+            130 after Ctrl-C, and 70 for a fault of the program.
     """
     try:
         with reporting(False if quiet else None), logged(command, quiet, verbose):
@@ -99,8 +108,13 @@ def _result(command: Command, options: dict[str, Any], json: Path | None) -> Any
 
 
 def table_of(result: Any) -> Any:
-    """Return the table of a result: the result itself, or the table attached to a network or
-    sensor.
+    """Return the table to print for the result of a verb.
+
+    Args:
+        result: what the verb returned: a `Table`, or a value such as a `Network`.
+
+    Returns:
+        The table itself, or the attribute `table` of the value; None if there is neither.
     """
     from beers_deploy.results import Table
 
@@ -127,7 +141,13 @@ def _show(result: Any, command: Command, quiet: bool, verbose: bool) -> None:
 
 @contextmanager
 def logged(command: Command, quiet: bool, verbose: bool) -> Iterator[None]:
-    """Print what the package logs on standard error while a command runs."""
+    """Print the log messages of this package on standard error within the `with` block.
+
+    Args:
+        command: the command, whose options replace parameter names in the messages.
+        quiet: True to print only errors; by default information and warnings are printed too.
+        verbose: True to print debug messages too, unless `quiet`.
+    """
     logger = logging.getLogger("beers_deploy")
     handler = Lines(command)
     before = logger.level, logger.propagate
@@ -149,7 +169,10 @@ def logged(command: Command, quiet: bool, verbose: bool) -> Iterator[None]:
 
 
 class Lines(logging.Handler):
-    """Prints each record as one line on standard error, above a bar of progress."""
+    """A log handler that prints each record as one line on standard error.
+
+    While a progress bar is shown, the line is printed above the bar.
+    """
 
     def __init__(self, command: Command) -> None:
         super().__init__()
@@ -176,7 +199,17 @@ class Lines(logging.Handler):
 
 
 def ending(error: BaseException, command: Command) -> tuple[str, int]:
-    """Return the message of an error that ends a command, and the exit code."""
+    """Map an error that ends a command to a message for the user and an exit code.
+
+    Args:
+        error: the error. One that is no `BeersError` is a fault of the program or of a library,
+            except lack of memory, a missing library and Ctrl-C.
+        command: the command, whose options replace parameter names in the message.
+
+    Returns:
+        The message in one line, and 2 for an error that the user can correct, 130 for Ctrl-C, or
+        70 for a fault.
+    """
     if isinstance(error, ImportError) and not isinstance(error, BeersError):
         error = missing_extra(error, command.name)
     if isinstance(error, BeersError):

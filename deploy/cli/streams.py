@@ -28,11 +28,14 @@ _results: ContextVar[TextIO | None] = ContextVar("results", default=None)
 
 
 class Stream:
-    """Standard output or error that does not end a run. Text that cannot be written is dropped, and
-    `lost` states the reason.
+    """A wrapper of standard output or error in which a failed write does not end the run.
 
-    A stream that was closed at the start accepts everything and loses nothing, because nobody asked
-    for its text.
+    Text that cannot be written, for example because a pipe was closed, is dropped. A stream that
+    was already closed when the program started drops all text without counting it as lost.
+
+    Attributes:
+        stream: the wrapped stream.
+        lost: the reason why text was dropped; empty if none was.
     """
 
     def __init__(self, stream: Any) -> None:
@@ -43,7 +46,7 @@ class Stream:
             self.stream.reconfigure(errors="backslashreplace")
 
     def write(self, text: str) -> int:
-        """Write the text and flush it, or drop it if that fails."""
+        """Write the text and flush it, or drop it if that fails, and return its length."""
         if not self.lost:
             try:
                 self.stream.write(text)
@@ -64,11 +67,15 @@ class Stream:
 
 @contextmanager
 def lasting_streams(results_on_stdout: bool) -> Iterator[Stream]:
-    """Replace the standard streams by lasting ones while a command runs, and yield the output.
+    """Replace standard output and error within the `with` block by streams whose failure does not
+    end the run.
 
     Args:
-        results_on_stdout: if True, standard output is for the results document alone, and
+        results_on_stdout: True if standard output is for the results document alone, so that
             everything else that is printed goes to standard error.
+
+    Yields:
+        The wrapped standard output, whose `lost` says at the end whether text was dropped.
     """
     out = Stream(sys.stdout)
     sys.stdout = cast(TextIO, out)
@@ -111,7 +118,15 @@ def delete_results(path: Path, inputs: Iterable[Path]) -> None:
 
 
 def save_results(table: "Table", path: Path | None) -> None:
-    """Write a table to the destination of --json: a file, standard output for `-`, or nowhere."""
+    """Write a table as a results document to the destination of --json.
+
+    Args:
+        table: the table.
+        path: the file; "-" for standard output; None to write nothing.
+
+    Raises:
+        OptionError: the file is another output of this run, which would be overwritten.
+    """
     if path == STDOUT:
         (_results.get() or sys.stdout).write(table.to_json())
     elif path is not None:

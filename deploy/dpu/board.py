@@ -15,18 +15,19 @@ BoardLike = TargetProfile | str | os.PathLike[str]
 """A board: its profile, its name, or the path of its .toml file."""
 
 Levels = tuple[int, ...]
-"""What a run has in common with others, from the most general (`cost/kinship.py`)."""
+"""Keys that two measured runs share if they have a property in common (`cost/kinship.py`)."""
 
 ALL = "all"
 """Every shipped board, or every configuration."""
 
 
 def boards_of(board: BoardLike | Sequence[BoardLike]) -> list[TargetProfile]:
-    """Load the target profiles of one or several boards.
+    """Load the target profiles of one or several boards, as `bench` accepts them.
 
     Args:
-        board: a board, several, or names separated by commas, each with or without the suffix
-            -model. "all" stands for the shipped boards with a DPU.
+        board: a board, a sequence of boards, or their names separated by commas. A name may have
+            the suffix -model, which tables add to the figures of the cost model. "all" stands for
+            the shipped boards with a DPU.
 
     Raises:
         ProfileError: there is no such board, or its file is not valid.
@@ -51,17 +52,20 @@ banks."""
 
 @dataclass(frozen=True)
 class Dpu:
-    """A configuration of the DPU. C32B3, for example, has 3 batch handlers, each with 32 AI engines
-    and 32 output channels at a time.
+    """One configuration of the DPU on a board, with the constants of the board.
 
-    A board may have several cores, which share only its memory. The three of the ZCU102's B4096,
-    each with one batch handler, run three images at once and load the weights three times.
+    A batch handler is the part of a core that computes one image. C32B3, for example, has 3 batch
+    handlers, each with 32 AI engines and 32 output channels at a time. A board may have several
+    cores, which share only its memory. The three of the ZCU102's B4096, each with one batch
+    handler, run three images at once and load the weights three times.
 
     Attributes:
-        target: the board.
-        name: the name of the configuration.
-        constants: the constants of the configuration.
-        runs: measured on the owner's board, with ln(given / predicted); none of a shipped one.
+        target: the profile of the board.
+        name: the name of the configuration, such as C32B3; "NPU" for a board with an NPU.
+        constants: the constants of the configuration, by key; empty for an NPU.
+        runs: frame rates measured on the user's own board, by which predictions are corrected. Each
+            has keys that say what the run has in common with others (`cost/kinship.py`), and
+            ln(measured / predicted). Empty without such measurements.
     """
 
     target: TargetProfile
@@ -71,7 +75,7 @@ class Dpu:
 
     @cached_property
     def tables(self) -> dict[str, dict[str, Constant]]:
-        """The target's tables, with the constants that the configuration overrides."""
+        """The board's constants by table and key, replaced where the configuration has its own."""
         sized = {
             name: {k: self.constants.get(k, v) for k, v in self.target.tables.get(name, {}).items()}
             for name in SIZED
@@ -98,64 +102,88 @@ class Dpu:
 
     @property
     def channels_max(self) -> int:
-        """The largest number of channels of an operator on the array."""
+        """The largest number of input or output channels of an operator on the DPU's array."""
         return self.whole("array", "channel_groups") * self.input_parallel
 
     @property
     def input_parallel(self) -> int:
-        """The number of input channels that a batch handler reads at a time."""
+        """The number of input channels that a batch handler reads in parallel."""
         return self.whole("array", "input_channel_parallel")
 
     @property
     def output_parallel(self) -> int:
-        """The number of output channels that a batch handler computes at a time."""
+        """The number of output channels that a batch handler computes in parallel."""
         return int(self.constants["cpb"].low)
 
     @property
     def engine_ops_per_s(self) -> float:
-        """Peak int8 operations a second of one batch handler. A multiply-accumulate counts as two.
-
-        The peak of the configuration is that of all cores together.
+        """Peak int8 operations a second of one batch handler. A multiply-accumulate counts as two
+        operations.
         """
         return self.peak_ops_per_s / self.batch
 
     @property
     def peak_ops_per_s(self) -> float:
-        """Peak int8 operations a second of all cores together."""
+        """Peak int8 operations a second of all cores together. A multiply-accumulate counts as two
+        operations.
+        """
         return self.constants["peak_tops"].low * 1e12
 
     @property
     def lane_steps_per_s(self) -> float:
-        """The number of values per second that an engine in programmable logic reads."""
+        """The number of values a second that the element-wise engine of a batch handler reads.
+
+        This engine in programmable logic computes additions, pools and depthwise convolutions.
+        """
         channels = self.value("elementwise", "channels_per_cycle")
         lanes = channels * self.value("elementwise", "pixels_per_cycle")
         return lanes * self.value("array", "pl_clock_hz")
 
     def limit(self, table: str, key: str) -> Constant:
-        """Return a constant with both limits of its range. A single limit stands for both."""
+        """Return a constant of the board or the configuration, with its source.
+
+        Args:
+            table: the table in the board's file, such as "conv".
+            key: the key in that table, such as "kernel".
+
+        Returns:
+            The constant, whose `low` and `high` are equal if it has one value.
+
+        Raises:
+            ProfileError: the board has no such constant.
+        """
         constant = self.tables.get(table, {}).get(key)
         return self.target.constant(table, key) if constant is None else constant
 
     def value(self, table: str, key: str) -> float:
-        """Return the single value of a constant."""
+        """Return a constant that has a single value; the arguments are those of `limit`."""
         return self.limit(table, key).low
 
     def whole(self, table: str, key: str) -> int:
-        """Return the value of a constant that is a count, as an int."""
+        """Return a constant that is a count, as an int; the arguments are those of `limit`."""
         return int(self.value(table, key))
 
 
 def load_dpu(target: str, configuration: str | None = None) -> Dpu:
-    """Read a target profile and one of its configurations."""
+    """Load a board by its name or .toml file, and select one configuration of its DPU.
+
+    Args:
+        target: the name of the board, or the path of its .toml file.
+        configuration: the name of the configuration; the board's default if None.
+
+    Raises:
+        OptionError: the board has no DPU.
+        ProfileError: there is no such board or configuration, or the file is not valid.
+    """
     return dpu_of(TargetProfile.load(target), configuration)
 
 
 def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
-    """Return one configuration of a target profile.
+    """Select one configuration of the DPU of a board that is loaded already.
 
     Args:
-        profile: the board. A profile from a user's file could not be loaded again by its name.
-        configuration: the name of the configuration; the default one if None.
+        profile: the board.
+        configuration: the name of the configuration; the board's default if None.
 
     Raises:
         OptionError: the board has no DPU.
@@ -183,16 +211,20 @@ def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
 
 
 def device_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
-    """Return the device whose rules a network is checked against: the DPU, or the NPU of the board.
-
-    An NPU has rules, but no constants for predictions.
+    """Select the device whose rules a network is checked against: the DPU or NPU of a board.
 
     Args:
         profile: the board.
-        configuration: the DPU's configuration; None for the board's default.
+        configuration: the name of the DPU's configuration; the board's default if None. It must be
+            None for an NPU.
+
+    Returns:
+        The device. That of an NPU is named "NPU" and has rules, but no constants for predictions.
 
     Raises:
-        OptionError: the board has an NPU, and a configuration is stated.
+        OptionError: the board has an NPU and a configuration is given, or has neither a DPU nor an
+            NPU.
+        ProfileError: there is no such configuration.
     """
     if not profile.npu:
         return dpu_of(profile, configuration)

@@ -42,12 +42,16 @@ damaged.
 
 
 def read_network(path: Path, tile_px: int | None = 640) -> SizedGraph:
-    """Read an ONNX file as the operations that a DPU computes.
+    """Read an ONNX file as the list of operations that a DPU would compute.
 
     Args:
-        path: the ONNX file.
-        tile_px: side of the image in pixels; None for the size that the file is fixed to. A core
-            that reads places of 2 x 2 pixels has planes of half the side.
+        path: the ONNX file, in float or INT8, whole or only the integer core for a board.
+        tile_px: side of the square image in pixels; None for the size that the file is fixed to.
+            For a core whose host moves squares of 2 x 2 pixels into channels, it is the side of the
+            image, not of the core's input.
+
+    Raises:
+        ModelError: the file is not a valid ONNX network of images of this size.
     """
     return network_of(load_onnx(path, to_run=False), tile_px, str(path))
 
@@ -55,6 +59,9 @@ def read_network(path: Path, tile_px: int | None = 640) -> SizedGraph:
 def own_tile_px(model: onnx.ModelProto) -> int | None:
     """Return the side in pixels of the image that a network is fixed to; None if it accepts any
     size.
+
+    For the integer core of a network, which reads int8 planes prepared by the host, it is the side
+    of the image that the planes are made from.
     """
     dims = model.graph.input[0].type.tensor_type.shape.dim
     side = max((d.dim_value for d in dims[2:]), default=0)
@@ -65,8 +72,11 @@ def own_tile_px(model: onnx.ModelProto) -> int | None:
 
 
 def _places(model: onnx.ModelProto) -> tuple[int, int]:
-    """Return what a board's file states about its planes: the side of a place in pixels, and how
-    far they extend beyond the image.
+    """Read the geometry of the planes from the metadata of a board's file.
+
+    Returns:
+        The side in pixels of a place, a square of pixels that the host moves into channels; and the
+        number of pixels by which the planes extend beyond the image on every side.
     """
     about = metadata(model)
     place_px = int(about.get(PLACE_PX, 1))
@@ -79,13 +89,14 @@ def _places(model: onnx.ModelProto) -> tuple[int, int]:
 def network_of(
     model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model"
 ) -> SizedGraph:
-    """Convert a model in memory like `read_network`.
+    """Convert an ONNX model in memory to the list of operations that a DPU would compute.
 
-    A host's file is converted to the board's file first.
+    An INT8 file for onnxruntime, which contains the steps of the host too, is first converted to
+    the file for the board.
 
     Args:
         model: the ONNX model.
-        tile_px: side of the image in pixels; None for the size that the file is fixed to.
+        tile_px: side of the square image in pixels; None for the size that the file is fixed to.
         where: name of the file, for messages.
 
     Raises:
@@ -102,14 +113,17 @@ def network_of(
 
 
 def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str) -> dict[str, Shape]:
-    """Return the shape (C, H, W) of each input of a file, by name.
-
-    H and W count places: squares of pixels that the host has moved into channels.
+    """Return the shape (C, H, W) of each input of a network for one image size, by name.
 
     Args:
-        model: the ONNX model, as stored.
-        tile_px: side of the image in pixels; None for the sizes that the file states.
+        model: the ONNX model. If its metadata state that the host moves squares of pixels into
+            channels, H and W count these squares.
+        tile_px: side of the square image in pixels; None for the sizes that the file states.
         where: name of the file, for messages.
+
+    Raises:
+        ModelError: an input is no image, has another fixed size, or cannot consist of whole
+            squares; or `tile_px` is None and the file states no size.
     """
     places = _places(model)
     return {
@@ -119,7 +133,9 @@ def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str) -> dict[s
 
 
 class _Reader:
-    """Visits the nodes once in topological order, and propagates shapes and number formats."""
+    """A conversion of one ONNX graph, which visits the nodes once in topological order and
+    propagates shapes and number formats.
+    """
 
     def __init__(self, graph: OnnxGraph, inputs: dict[str, Shape]) -> None:
         self.graph = graph

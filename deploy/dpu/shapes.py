@@ -57,7 +57,16 @@ WINDOWED = ("conv", "grouped conv", "depthwise", "transposed", "pool")
 
 
 def kind_of(node: Node, weight: np.ndarray | None) -> Kind:
-    """Return the kind of a node. Convolutions are distinguished by their weights."""
+    """Classify an ONNX node by what it computes, whatever the encoding of the file.
+
+    Args:
+        node: the ONNX node.
+        weight: its weights, whose shape distinguishes depthwise and grouped convolutions; None if
+            the node has none.
+
+    Returns:
+        The kind; "other" for an operator that the DPU does not know.
+    """
     kind = KINDS.get(node.op_type, "other")
     if kind != "conv" or weight is None or node.attributes.get("group", 1) == 1:
         return kind
@@ -73,16 +82,19 @@ def out_shape(
     channels: int,
     constants: Mapping[str, np.ndarray],
 ) -> Shape | None:
-    """Return the shape (C, H, W) of a node's first result, or None if it cannot be inferred.
+    """Infer the shape of the first output of a node.
 
     Args:
-        node: the node.
+        node: the ONNX node.
         kind: its kind of operation.
-        shapes: the shapes of the tensors that it reads.
-        kernel: the kernel of a convolution or pool.
+        shapes: the shape (C, H, W) of each activation that the node reads; None if unknown.
+        kernel: height and width of the kernel of a convolution or pool.
         window: strides, pads and dilations of the kernel.
-        channels: the channels of a convolution's result.
-        constants: the file's, for operators that read sizes from them.
+        channels: the number of output channels of a convolution or pool.
+        constants: the constants of the file by name. Some operators read sizes from them.
+
+    Returns:
+        The shape (C, H, W); None if it cannot be inferred.
     """
     inputs = [shape for shape in shapes if shape is not None]
     if not inputs or len(inputs) != len(shapes):

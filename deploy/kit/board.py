@@ -32,7 +32,11 @@ MEASURE, HOST, README = (
 
 
 class Board(TargetProfile):
-    """A processing board: its DPU's configurations, rules and cost constants, each with its source.
+    """A processing board with a DPU or NPU, as its profile describes it.
+
+    The profile is a TOML file with the configurations (builds) of the accelerator, the limits of
+    its operator rules, and the constants of the cost model, each with its source. `Board.load`
+    reads a shipped one by its name, or a user's file.
 
     Examples:
         >>> bd.Board.load("zcu104").default_configuration
@@ -48,27 +52,33 @@ class Board(TargetProfile):
         record: bool = False,
         sensor: SensorLike | None = None,
     ) -> Path:
-        """Write what a board's engineer needs of an INT8 network to a folder, and return it.
+        """Write a folder with all that an engineer needs to run an INT8 network on this board.
 
-        `core.onnx` is the part that the DPU computes, fixed to a tile. `measure.py` times it there
-        and writes `board.json`, which `bench` accepts as `measured`. `input.npy` and `expected.npy`
-        are one input of the core and its result from onnxruntime on this processor. `host.py` is
-        the host part in plain NumPy, and `golden` contains the expected output of every layer.
-        README.md explains what to do on the board.
+        `core.onnx` is the integer core: the part that the DPU computes, fixed to a tile.
+        `measure.py` times it on the board and writes `board.json`, which `bench` accepts as
+        `measured`. `input.npy` and `expected.npy` are one input of the core and its result from
+        onnxruntime on this processor. `host.py` is the host part, the steps before and after the
+        core, in plain NumPy. `golden` contains the expected output of every layer. README.md
+        explains what to do on the board.
 
-        With a sensor, `host.py` takes the same steps around the network as `restore`: the
-        consistency step, and for a shipped network the exposures, whose cores are `core-x4.onnx`
-        and so on. The golden vectors are those of `core.onnx`.
+        With a sensor, `host.py` takes the same steps around the network as `restore`. The
+        consistency step makes block means of the result agree with the raw image. With exposures,
+        which only a shipped network has, dark pixels are multiplied by a factor before the network
+        and divided afterwards; the cores of the factors are `core-x4.onnx` and so on. The golden
+        vectors are those of `core.onnx`.
 
         Args:
             int8: the network, quantised under this board's rules.
-            out: the folder.
-            tile: side of a tile in pixels.
-            record: whether to add a record of evidence: what the network is, and the result of
+            out: the folder to write.
+            tile: side of a tile in pixels, the only image size that the cores accept.
+            record: True to add a record of evidence: what the network is, and the result of
                 `check`.
             sensor: the sensor that acquires the images: a `Sensor`, a name or a .toml file. A
                 shipped network is conditioned on it. None stands for the middle of the sensors that
                 the network supports, and omits the steps around the network.
+
+        Returns:
+            The path of the folder.
 
         Raises:
             MissingExtraError: a record is requested, and cyclonedx-python-lib is not installed.

@@ -15,14 +15,21 @@ logger = logging.getLogger(__name__)
 def require_core_file(
     target: TargetProfile, path: Path | None, tile: int | None, inputs: Iterable[Path | None]
 ) -> None:
-    """Raise an error if a core cannot be written. The core of an NPU needs a tile, and its
-    compiler's files must be writable.
+    """Check before any work that the integer core of a network can be written for a board.
+
+    The core for an NPU must be fixed to a tile, and a configuration is written next to it. The core
+    for a DPU passes.
 
     Args:
-        target: the board whose encoding the core has.
-        path: the path of the core; None if none is written.
-        tile: side that it is fixed to, or None.
-        inputs: files that are read, and may not be replaced.
+        target: the board.
+        path: the ONNX file of the core; None if none is to be written, which passes.
+        tile: side in pixels of the only image size that the core accepts; None for any size.
+        inputs: the files that the run reads, which the configuration may not replace.
+
+    Raises:
+        OptionError: the board has an NPU, and there is no tile, or the configuration would replace
+            an input.
+        MachineError: the configuration cannot be written.
     """
     if path is not None and target.npu:
         required_tile(tile, OF_NPU)
@@ -30,13 +37,13 @@ def require_core_file(
 
 
 def save_core(core: Network, path: Path, target: TargetProfile) -> None:
-    """Write the integer core of a network as ONNX in the board's encoding.
+    """Write the integer core of a network, which `Network.core` returned, as an ONNX file.
 
-    For a target with an NPU, the configuration of AMD's compiler is written next to it.
+    For a board with an NPU, the configuration of AMD's compiler is written next to it.
 
     Args:
-        core: the network without its host part.
-        path: the path of the ONNX file.
+        core: the core in the encoding of the board.
+        path: the ONNX file to write.
         target: the board.
     """
     core.save(path)

@@ -52,13 +52,21 @@ def write_golden(
     tile: int | None = None,
     target: BoardLike = DEFAULT_TARGET,
 ) -> Path:
-    """Write golden vectors of an INT8 network to a folder, and return it.
+    """Write golden vectors of an INT8 network: the values that a board must compute in each layer.
 
     Args:
         int8: the network, quantised under a board's rules.
-        out: the folder.
-        tile: side of a tile in pixels; the network's own if it has one, else 64.
-        target: the board whose rounding of ties is used.
+        out: the folder to write. Older golden vectors in it are deleted.
+        tile: side of the square test images in pixels; None for the size that the network is fixed
+            to, or the first multiple of its alignment from 64 pixels on.
+        target: the board, which decides how halves are rounded: up on a DPU, to even on an NPU.
+
+    Returns:
+        The path of the folder.
+
+    Raises:
+        ModelError: the network was not made by `quantize`.
+        OptionError: the network does not accept images of this size.
     """
     network = Network.load(int8, int8=True)
     folder = Path(out)
@@ -97,7 +105,14 @@ def write_golden(
 
 
 def vectors_table(folder: Path) -> Table:
-    """Return a table of the cases in a folder of golden vectors."""
+    """List the cases (test images) in a folder of golden vectors, with the number of tensors.
+
+    Args:
+        folder: a folder that `write_golden` wrote.
+
+    Raises:
+        OptionError: the folder has no index, or a damaged one.
+    """
     digests, _ = _index(folder / INDEX)
     rows = [Row("cases", case, {}, {"tensors": str(len(files))}) for case, files in digests.items()]
     return Table(title=f"golden vectors in {folder}", inputs=(folder / NETWORK,), rows=tuple(rows))
@@ -121,7 +136,11 @@ def _remove_older(folder: Path) -> None:
 
 
 def files_of(core: IntCore) -> dict[str, str]:
-    """Return the file name of every tensor of a core, in the order in which they are computed."""
+    """Return the file name of every tensor of an integer core, by the name of the tensor.
+
+    File names begin with a number in the order of computation, such as "03-body.0.relu.npy". The
+    first tensor is the input of the core.
+    """
     tensors = [PLANES, *(op.output for op in core.ops)]
     return {
         name: f"{k:02d}-{re.sub(r'[^A-Za-z0-9._-]+', '_', name)}.npy"
@@ -192,7 +211,7 @@ def _scene(channels: int, rows: int, columns: int, generator: np.random.Generato
 
 
 def save_array(path: Path, values: np.ndarray) -> None:
-    """Write an array as .npy, atomically."""
+    """Write an array as a .npy file, atomically."""
     with whole_file(path) as temporary, temporary.open("wb") as stream:
         np.save(stream, values)
 
@@ -203,13 +222,13 @@ def _digest(values: np.ndarray) -> str:
 
 @dataclass(frozen=True)
 class Golden:
-    """A folder of golden vectors that was read.
+    """The content of a folder of golden vectors: the values that a board must compute.
 
     Attributes:
-        core: the network's integer core.
-        half_even: True if ties are rounded to even.
-        cases: every golden tensor of each case.
-        network: name and digest of the network's file in the folder.
+        core: the integer core of the network.
+        half_even: True if halves are rounded to even, False if they are rounded up.
+        cases: the integers (N, C, H, W) of each tensor, by the name of the case and of the tensor.
+        network: name and SHA-256 of the network's file in the folder.
     """
 
     core: IntCore
@@ -219,11 +238,17 @@ class Golden:
 
 
 def read_golden(folder: Path) -> Golden:
-    """Read a folder that `write_golden` wrote. Its tensors are recomputed and compared with their
-    digests.
+    """Read a folder that `write_golden` wrote.
+
+    All tensors are computed again from the inputs in the folder, and compared with the digests in
+    its index.
+
+    Args:
+        folder: the folder.
 
     Raises:
         OptionError: the folder has no index, a damaged one, or other numbers than were written.
+        ImageError: the inputs of a case are not int8 arrays of the network's channels.
     """
     digests, half_even = _index(folder / INDEX)
     network = Network.load(folder / NETWORK)
@@ -292,7 +317,11 @@ def _planes(path: Path, core: IntCore) -> np.ndarray:
 
 
 def read_array(path: Path) -> np.ndarray:
-    """Read one array of a .npy file."""
+    """Read the array of a .npy file.
+
+    Raises:
+        ImageError: the file is not readable as one array, or is an archive (.npz).
+    """
     try:
         arrays = load_arrays(path)
         if list(arrays) != [ALONE]:

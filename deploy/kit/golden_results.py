@@ -22,8 +22,11 @@ from beers_deploy.results import Table
 
 @dataclass(frozen=True)
 class Written:
-    """One tensor in one case, (N, C, H, W) int16: the golden values, and those that a board
-    wrote.
+    """One tensor that a board wrote for one test image, next to its golden values.
+
+    Attributes:
+        sound: the golden values, integers (N, C, H, W).
+        board: the values that the board wrote, int16 (N, C, H, W).
     """
 
     sound: np.ndarray
@@ -31,7 +34,7 @@ class Written:
 
     @property
     def differs(self) -> np.ndarray:
-        """Return a mask of the values that differ, (N, C, H, W)."""
+        """Return True for each value that differs from the golden one, (N, C, H, W) bool."""
         return np.asarray(self.sound != self.board)
 
 
@@ -42,13 +45,22 @@ entry for each case.
 
 
 def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[str]) -> Table:
-    """Compare the results of a board with golden vectors. The table is false if a layer differs.
+    """Compare what a board computed with golden vectors, layer by layer.
 
     Args:
-        folder: the folder of the golden vectors.
-        results: folders with the cases' names that contain files with the layers' names, any of
-            them. Values are int8, uint8 around 128, or float multiples of the tensor's scale, with
-            the channels first or last.
+        folder: the folder that `write_golden` wrote.
+        results: a folder of the board's tensors with the same names, CASE/LAYER.npy; some of them
+            suffice. Values are int8, uint8 around 128, or float multiples of the tensor's scale,
+            with the channels first or last.
+
+    Returns:
+        A row for each layer that was compared: the share of values that differ, the largest
+        difference, and where they lie. The table is false if a layer differs.
+
+    Raises:
+        OptionError: a file has another name than the golden vectors, or there is none; or the
+            golden vectors are damaged.
+        ImageError: a file does not hold int8 values of the expected shape.
     """
     golden = read_golden(Path(folder))
     results_folder = Path(results)
@@ -158,8 +170,14 @@ def _row(core: IntCore, name: str, cases: list[Written]) -> Row:
 
 
 def where(differs: np.ndarray) -> str:
-    """Return where values of tiles (N, C, H, W) differ: nowhere (""), in one channel, along the
-    border, in some rows or columns, or everywhere.
+    """Describe where wrong values lie, because the pattern hints at the cause.
+
+    Args:
+        differs: True for each value that differs, (N, C, H, W).
+
+    Returns:
+        Words such as "within 2 px of the border, in channel 3": the border, some rows or columns,
+        or everywhere, and the channels. The text is empty if nothing differs.
     """
     if not differs.any():
         return ""

@@ -47,7 +47,7 @@ UNITS = {1: S["unit"], **{int(factor): unit for factor, unit in S["exposures"].i
 
 
 def shuffled(x: np.ndarray, r: int, up: bool) -> np.ndarray:
-    """Move squares of r x r pixels of (1, C, H, W) into the channels.
+    """Move squares of r x r pixels of (1, C, H, W) into the channels: (1, C r^2, H / r, W / r).
 
     If `up`, move channels back into pixels: (1, C / r^2, r H, r W).
     """
@@ -61,9 +61,9 @@ def shuffled(x: np.ndarray, r: int, up: bool) -> np.ndarray:
 
 
 def encoded(image: np.ndarray) -> np.ndarray:
-    """Encode a tile (1, C, h, w) as the core's planes (1, P, h', w'): coarse, remainder and part.
+    """Encode a tile (1, C, h, w) as the planes (1, P, h', w') that the core reads as int8 / 128.
 
-    They are multiples of 1/128, because the core reads int8 at that scale.
+    Each pixel in 12 bits is split into coarse steps and a rest, which is also given in parts.
     """
     wide = np.pad(image, ((0, 0), (0, 0), *[(S["border_px"],) * 2] * 2), "reflect")
     places = shuffled(wide, S["front"], up=False)
@@ -76,22 +76,22 @@ def encoded(image: np.ndarray) -> np.ndarray:
 
 
 def plain(value: np.ndarray) -> np.ndarray:
-    """Return the only copy of a result unchanged."""
+    """Decode a result of which the core writes only one copy: return it unchanged."""
     return value
 
 
 def fits(fine: np.ndarray) -> np.ndarray:
-    """Return a mask of the values of a fine copy that are not clipped."""
+    """Return True for the values of a copy in fine steps that the limits of int8 do not clip."""
     return np.asarray(np.abs(fine) <= F(S["fine_max"]))
 
 
 def dual_range(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
-    """Choose the fine copy where it is not clipped, else the coarse one."""
+    """Merge two copies of a result: where the one in fine steps is clipped, take the coarse one."""
     return np.where(fits(fine), fine, coarse * F(S["gain"]))
 
 
 def offset_windows(coarse: np.ndarray, *windows: np.ndarray) -> np.ndarray:
-    """Merge a coarse copy (1, C, h, w) of a result with fine ones of values around their offsets.
+    """Merge a coarse copy (1, C, h, w) of a result with copies in fine steps around offsets.
 
     A value is taken from the last window that does not clip it, or else from the coarse copy.
     """
@@ -102,7 +102,7 @@ def offset_windows(coarse: np.ndarray, *windows: np.ndarray) -> np.ndarray:
 
 
 def bank_sum(fine: np.ndarray, coarse: np.ndarray, *analytic: np.ndarray) -> np.ndarray:
-    """Return the sum of the correction and of the copies of the analytic restoration."""
+    """Add the network's correction and the linear restoration, which has several copies."""
     added = np.sum(analytic[: S["fine_copies"]], 0) * F(S["fine_gain"])
     # The last copy may be a coarse one, for values at which the others are clipped.
     if S["coarse_gain"]:
@@ -122,7 +122,7 @@ host.json.
 
 
 def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
-    """Restore a tile (1, C, h, w) by one core: encode it, decode the result, and add both.
+    """Restore a tile (1, C, h, w) by one core: encode it, decode the result, and add the tile.
 
     `run` computes the core's result (1, copies C', h', w') from the planes, and `unit` is the share
     of full scale that is 1 in the decoded result.
@@ -137,9 +137,8 @@ def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
 
 
 def exposed(factor: int, image: np.ndarray, run: Any) -> np.ndarray:
-    """Restore a tile whose light is multiplied by a factor by that factor's core, and divide it.
-
-    The dark offset is not light and stays.
+    """Multiply the light of a tile (1, C, h, w) by a factor, restore it by that factor's core
+    `run`, and divide the result. The sensor's dark offset is not light and stays.
     """
     if factor == 1:
         return restored(image, run, UNITS[1])
@@ -149,7 +148,7 @@ def exposed(factor: int, image: np.ndarray, run: Any) -> np.ndarray:
 
 
 def factors(tile: np.ndarray) -> np.ndarray:
-    """Choose the factor of every pixel (h, w) of a tile (1, C, h, w).
+    """Choose the exposure, a factor of brightness, of every pixel (h, w) of a tile (1, C, h, w).
 
     A pixel gets the largest factor at which no pixel within the network's receptive radius exceeds
     `headroom`.
@@ -181,7 +180,7 @@ def brightest_around(pixels: np.ndarray, radius: int) -> np.ndarray:
 
 
 def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return x + G (raw - H x) of one band (H, W), clipped to [0, 1].
+    """Correct a restored band x (H, W) to x + G (raw - H x), clipped to [0, 1].
 
     H is the sensor's blur relative to the reference. G computes the means of blocks and
     interpolates between their centres, which retains only low spatial frequencies.
@@ -212,7 +211,7 @@ def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def detail(raw: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Compute the part for finer detail from one band and `near`, x with NEAR pixels around it.
+    """Compute the correction (H, W) of finer detail from a raw band and `near`, x extended by NEAR.
 
     It is the residual of fine blocks without that of the large ones, and 0 at the image's border.
     """
@@ -230,7 +229,7 @@ def detail(raw: np.ndarray, near: np.ndarray) -> np.ndarray:
 
 
 def judged(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return two figures (2, n, m) of each block of CHECK pixels a side of one band (H, W).
+    """Compute the self-check of one band (H, W): two figures (2, n, m) of blocks of CHECK pixels.
 
     The first is chi2, the mean of (raw - H x)^2 / variance of the noise, in which the means of
     small cells count less. The second is the mean of (x - H x)^2 / variance, which shows whether a
@@ -261,14 +260,14 @@ def judged(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def sums(values: np.ndarray, side: int) -> np.ndarray:
-    """Return the sums over squares of `side` values a side of (H, W)."""
+    """Return the sums of an array (H, W) over squares of `side` x `side` values, (n, m)."""
     down, across = (np.arange(0, length, side) for length in values.shape)
     by_rows = np.add.reduceat(values, down, 0, dtype=float)
     return np.asarray(np.add.reduceat(by_rows, across, 1))
 
 
 def report(blocks: np.ndarray) -> str:
-    """Return a sentence on the blocks (bands, 2, n, m) that contradict the raw image."""
+    """Count the blocks that contradict the raw image, in a sentence; blocks (bands, 2, n, m)."""
     facts = S["self_check"]
     chi2 = blocks[:, 0]
     sharpening = blocks[:, 1]
@@ -306,7 +305,7 @@ def block_means(x: np.ndarray, side: int = BLOCK) -> np.ndarray:
 
 
 def around(means: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """Compute the far part of H x: the means around each block, weighted by `far`."""
+    """Compute the far part of the blur H x: `far` weights the block means around each block."""
     height, width = (size - len(far) + 1 for size in means.shape)
     total = np.zeros((height, width), F)
     for y, weights in enumerate(far):
@@ -316,12 +315,12 @@ def around(means: np.ndarray, far: np.ndarray) -> np.ndarray:
 
 
 def inner(count: int) -> tuple[int, int]:
-    """Return the first and the end of the blocks that count among `count` along a side."""
+    """Return (first, end) of the blocks that count: of more than 4, all but 2 at each end."""
     return (2, count - 2) if count > 4 else (0, count)
 
 
 def interpolated(blocks: np.ndarray, shape: tuple[int, ...], side: int = BLOCK) -> np.ndarray:
-    """Interpolate bilinearly between the centres of blocks of `side` pixels.
+    """Interpolate bilinearly between the centres of blocks of `side` pixels, to (H, W) = `shape`.
 
     Blocks at the image's border are left out, because H brings light into them that the image does
     not show. Nearer to the border the nearest block inside counts.
@@ -336,7 +335,7 @@ def interpolated(blocks: np.ndarray, shape: tuple[int, ...], side: int = BLOCK) 
 
 
 def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
-    """Return the start of each tile along a side, and the start and end of its retained pixels.
+    """Return the start of each tile along `size` pixels, and start and end of its retained pixels.
 
     Tiles overlap by at least two halos, the pixels that are discarded at a tile's inner borders.
     """
@@ -348,7 +347,7 @@ def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
 
 
 def main(source: str, target: str, runs: dict[int, Any]) -> None:
-    """Restore an image of at least a tile, tile by tile, by the core of each factor in `runs`."""
+    """Restore the image in `source` into `target`, tile by tile; `runs` has each factor's core."""
     image = np.load(source).astype(F)
     t = S["tile_px"]
     r = S["scale"]
@@ -381,7 +380,7 @@ def main(source: str, target: str, runs: dict[int, Any]) -> None:
 
 
 def cores() -> dict[int, Any]:
-    """Open the core of each factor in onnxruntime; a board has runners of its own instead."""
+    """Open the core of each exposure factor in onnxruntime; a board has other runners instead."""
     import onnxruntime as ort
 
     # onnxruntime's fused kernels may saturate.

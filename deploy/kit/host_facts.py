@@ -32,13 +32,21 @@ def host_facts(
     sensor: Sensor | None = None,
     brighter: Mapping[int, Network] | None = None,
 ) -> Facts | None:
-    """Return the content of host.json, or None if `host.py` cannot compute the network's host part.
+    """Compute the content of host.json, from which a kit's `host.py` runs the host part.
+
+    The host part is all that a DPU does not compute: encoding pixels as int8, decoding the result,
+    and the steps around the network.
 
     Args:
-        network: in INT8.
-        tile_px: side of a tile.
+        network: the INT8 network.
+        tile_px: side of a tile in pixels.
         sensor: the sensor that acquires the images; None omits the steps around the network.
-        brighter: the network for higher exposures, by factor.
+        brighter: the networks for dark pixels, by the exposure factor by which pixels are
+            multiplied before the network; None for none.
+
+    Returns:
+        The constants by name, as JSON can hold them; None if `host.py` cannot compute the host part
+        of this network.
 
     Raises:
         OptionError: the sensor would change nothing.
@@ -69,11 +77,15 @@ def host_facts(
 
 
 def host_constants(network: Network, tile_px: int) -> Facts | None:
-    """Return the constants of the host part around one core.
+    """Return the constants by which `host.py` encodes a tile, and decodes the result of the core.
+
+    Args:
+        network: the INT8 network.
+        tile_px: side of a tile in pixels.
 
     Returns:
-        None if the network's result is not an image, or if its pixels are rearranged in another way
-        than in `host.py`.
+        The constants by name, as host.json has them; None if the core does not read encoded pixels,
+        or if pixels are rearranged in another way than in `host.py`.
     """
     core = read_core(network.model)
     part = core.host_part
@@ -121,8 +133,15 @@ def _unit(facts: Facts, brighter: Network, tile_px: int) -> object:
 
 
 def self_check_facts(sensor: Sensor) -> Facts:
-    """Return the sensor's constants for the self-check, for pixels that are shares of full
-    scale.
+    """Return the constants of the self-check, which blurs the result as the sensor blurs and
+    compares it with the raw image.
+
+    Args:
+        sensor: the sensor that acquires the images.
+
+    Returns:
+        The weights of the blur, the variances of the noise and the limits, for pixels in [0, 1] of
+        full scale, by the names that `host.py` reads.
     """
     check = SelfCheck.of(sensor.nominal(), sensor.reference.nominal(), full_scale=1.0)
     return {
@@ -137,11 +156,17 @@ def self_check_facts(sensor: Sensor) -> Facts:
 
 
 def consistency_facts(network: Network, sensor: Sensor) -> Facts | None:
-    """Return the weights of the consistency step for pixels that are shares of full scale.
+    """Return the constants of the consistency step, which makes block means of the result agree
+    with the raw image.
+
+    Args:
+        network: the INT8 network.
+        sensor: the sensor that acquires the images.
 
     Returns:
-        None if no sensor is known, or if the network changes the grid of pixels or bands: `restore`
-        omits the step there too. A network of another range than [0, 1] has none either.
+        The weights for pixels in [0, 1] of full scale, by the names that `host.py` reads. None if
+        the sensor is the unknown one, or if the network changes the image size or the bands or
+        reads another range than [0, 1]; `restore` omits the step then too.
     """
     tiling = network.tiling
     if sensor.name == BLIND or not keeps_pixels(tiling) or network.input_ranges:

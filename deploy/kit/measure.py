@@ -35,8 +35,9 @@ LATENCY_CALLS = 20
 
 
 def main() -> int:
-    """Open, compare, measure and write. Return 0 when done, and 2 for an error that the user can
-    correct.
+    """Run the script: measure the network and add the result to the JSON file.
+
+    Return the exit code: 0 when done, 2 for an error that the user can correct.
     """
     options = arguments()
     try:
@@ -50,7 +51,7 @@ def main() -> int:
 
 
 def arguments() -> argparse.Namespace:
-    """Parse the command line."""
+    """Parse the command line. `--help` describes the options."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -78,7 +79,18 @@ def arguments() -> argparse.Namespace:
 
 
 def measure(options: argparse.Namespace) -> dict[str, object]:
-    """Measure one run, and return it as an entry of the list."""
+    """Measure the rate, the latency and, if asked, the power of a network.
+
+    The outputs are first compared with those of onnxruntime's CPU provider, unless this is switched
+    off. Progress is printed.
+
+    Args:
+        options: the options of the command line.
+
+    Returns:
+        An entry of board.json: the name of the model, the DPU's configuration, the tile side, the
+        rate in frames per second, the provider and, if measured, the mean power in W.
+    """
     session = open_session(
         options.model, options.provider, dict(option.split("=", 1) for option in options.option)
     )
@@ -108,14 +120,19 @@ def measure(options: argparse.Namespace) -> dict[str, object]:
 
 
 def kit_tile_px(facts: Path) -> int:
-    """Return the side of a kit's tiles by its host.json, or 640 if there is none."""
+    """Return the tile side in pixels that a kit's host.json states, or 640 without that file."""
     if not facts.is_file():
         return 640
     return int(json.loads(facts.read_text(encoding="utf-8"))["tile_px"])
 
 
 def open_session(model: Path, provider: str, options: dict[str, str]) -> ort.InferenceSession:
-    """Open a session that really runs on the provider.
+    """Open a network in onnxruntime, and make sure that the provider itself runs it.
+
+    Args:
+        model: the ONNX file.
+        provider: the name of the execution provider, such as VitisAIExecutionProvider.
+        options: the options of the provider, by name.
 
     Raises:
         ValueError: the provider is not available, or onnxruntime fell back to another.
@@ -137,9 +154,21 @@ def open_session(model: Path, provider: str, options: dict[str, str]) -> ort.Inf
 
 
 def make_feed(session: ort.InferenceSession, batch: int, tile_px: int) -> dict[str, np.ndarray]:
-    """Return noise that quantisation leaves unchanged: multiples of 2^-7, or int8 itself. It is the
-    same in every run. Sizes that the model fixes are kept: a core may read a border around its
-    tile, or several pixels as channels of one place.
+    """Make an input of noise, the same in every run, that int8 represents exactly.
+
+    Values are int8 if the network reads int8, otherwise float32 multiples of 2^-7.
+
+    Args:
+        session: the network. Sizes that it fixes are used, because a core may read a border around
+            its tile, or squares of pixels as channels.
+        batch: the number of tiles in a call.
+        tile_px: side of a tile in pixels, for sizes that the network leaves open.
+
+    Returns:
+        The arrays (batch, C, H, W) by the name of the input.
+
+    Raises:
+        ValueError: the network is fixed to another number of tiles.
     """
     random = np.random.default_rng(0)
     feed = {}
@@ -160,8 +189,14 @@ def make_feed(session: ort.InferenceSession, batch: int, tile_px: int) -> dict[s
 
 
 def compare(model: Path, session: ort.InferenceSession, feed: dict[str, np.ndarray]) -> None:
-    """Print how much the outputs differ from the CPU provider's. A model that compiles may still
-    compute other values.
+    """Print how much the outputs differ from those of onnxruntime's CPU provider.
+
+    A network that compiles for the board may still compute other values there.
+
+    Args:
+        model: the ONNX file.
+        session: the network on the provider that is measured.
+        feed: the inputs by name.
     """
     expected = ort.InferenceSession(str(model), providers=["CPUExecutionProvider"]).run(None, feed)
     for tensor, ours, reference in zip(session.get_outputs(), session.run(None, feed), expected):  # noqa: B905
@@ -179,8 +214,17 @@ def run_threads(
     threads: int,
     power_files: list[Path],
 ) -> tuple[list[float], list[float]]:
-    """Run `calls` calls, several at a time. Return the time at which each ended, in seconds, and
-    the power in watts meanwhile.
+    """Run the network many times from several threads.
+
+    Args:
+        session: the network.
+        feed: the inputs of each call by name.
+        calls: the number of calls of all threads together.
+        threads: the number of threads, each of which has one call in flight.
+        power_files: files with the power in microwatts, which are summed; empty to measure none.
+
+    Returns:
+        The time at which each call ended in s, ascending, and samples of the power in W.
     """
     stamps: list[float] = []
     # All threads share this iterator: one step of it is not interrupted by another thread.
@@ -204,8 +248,13 @@ def run_threads(
 
 
 def throughput(stamps: list[float], batch: int) -> float:
-    """Return the frames per second: (N - 1) / (t_N - t_1) calls, which excludes the latency of the
-    first.
+    """Compute the frames per second: batch (N - 1) / (t_N - t_1) for N calls.
+
+    The first call only starts the clock, so its latency does not count.
+
+    Args:
+        stamps: the times t_1 ... t_N in s at which the calls ended, ascending.
+        batch: the number of frames (tiles) in a call.
 
     Raises:
         ValueError: there are fewer than two calls.
@@ -218,7 +267,11 @@ def throughput(stamps: list[float], batch: int) -> float:
 
 
 def write_entry(entry: dict[str, object], path: Path) -> None:
-    """Add a run to the list in a JSON file."""
+    """Add an entry to the list in a JSON file, which is created if it does not exist.
+
+    Raises:
+        ValueError: the file does not contain a list.
+    """
     runs = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
     if not isinstance(runs, list):
         raise ValueError(

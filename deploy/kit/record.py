@@ -45,7 +45,7 @@ BULKY = {KEY, SENSOR_BIASES}
 
 
 def recorded(folder: Path) -> list[Path]:
-    """Return the paths of the files of a record."""
+    """Return the paths of the three files of a record: JSON, HTML page, and bill of materials."""
     return [folder / name for name in RECORD]
 
 
@@ -59,14 +59,20 @@ def require_library() -> None:
 def write_record(
     judged: Table, network: Network, sensor: Sensor, folder: Path, floating: Network | None = None
 ) -> None:
-    """Write a record of a network, with the result of a verb, as JSON, a page and CycloneDX 1.6.
+    """Write a record of evidence: what an INT8 network is, what made it, and what was checked.
+
+    It is written as JSON, as an HTML page and as a CycloneDX 1.6 bill of materials. All three are
+    composed before the first is written.
 
     Args:
-        judged: figures and checks, with the inputs that they rest on.
-        network: the INT8 network that they describe.
-        sensor: the sensor that it is conditioned on.
+        judged: the result of `gate` or `check` for the network.
+        network: the INT8 network.
+        sensor: the sensor that the network is conditioned on.
         folder: the folder of the three files.
-        floating: the float network that it was compared with.
+        floating: the float network that it was compared with; None without a comparison.
+
+    Raises:
+        MissingExtraError: cyclonedx-python-lib is not installed.
     """
     record = record_of(judged, network, sensor, floating)
     # All three are made before the first is written: a record is whole or not there.
@@ -78,11 +84,18 @@ def write_record(
 def record_of(
     judged: Table, network: Network, sensor: Sensor, floating: Network | None = None
 ) -> dict[str, Any]:
-    """Return the record as one document, in which unknown values are null.
+    """Compose the record of a network as a dictionary that JSON can hold.
 
-    The INT8 file may claim anything: its claims are under "says". Weights, their training, their
-    licence and the range of sensors that they were trained on are stated only if the weights are
-    verified.
+    The metadata of the INT8 file may claim anything, so they are only quoted, under "says". The
+    digest of the weights, their training, their licence and the range of sensors that they were
+    trained on are stated if the network is found to be derived from shipped weights. Otherwise
+    these values are None.
+
+    Args:
+        judged: the result of `gate` or `check` for the network.
+        network: the INT8 network.
+        sensor: the sensor that the network is conditioned on.
+        floating: the float network that it was compared with; None without a comparison.
     """
     about = metadata(network.model)
     weights = _verified_weights(network, sensor, floating)
@@ -114,7 +127,9 @@ def _has_family(network: Network) -> bool:
 
 
 def code_sha256() -> str:
-    """Return the SHA-256 of all sources of this package: their names and bytes, in order."""
+    """Return a SHA-256 of the names and bytes of all Python files of this package, by which a
+    record states the code that made it.
+    """
     root = Path(__file__).parents[1]
     digest = hashlib.sha256()
     # In this order and with these slashes the digest is the same on every system.
@@ -169,8 +184,16 @@ def _page(judged: Table, record: dict[str, Any]) -> Report:
 
 
 def bill_of(document: dict[str, Any]) -> str:
-    """Return a bill of materials in CycloneDX 1.6. The library has no model cards yet, so facts are
-    properties.
+    """Convert a record to a bill of materials in CycloneDX 1.6.
+
+    The network is the main component, and the inputs of its results are its dependencies. Facts are
+    properties, because the library does not support model cards yet.
+
+    Args:
+        document: the record, as `record_of` returns it.
+
+    Returns:
+        JSON text. The serial number of the bill is derived from the record.
     """
     from cyclonedx.model import HashAlgorithm, HashType, Property
     from cyclonedx.model.bom import Bom

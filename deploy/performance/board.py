@@ -86,12 +86,12 @@ DETAILS = frozenset(
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Bench(Table):
-    """The speed, power and energy of a network, next to those of the traditional pipeline.
+    """The result of `bench`: speed, power and energy of a network and of the traditional pipeline.
 
     Attributes:
-        swath: the image that the rows describe; None for a network that is not tiled, or for a
-            host.
-        dn: digital numbers (H, W) of the image; None for a simulated one.
+        swath: the image that the rows describe and its tiles; None for a network that runs on whole
+            images, or for times on this machine.
+        dn: digital numbers (H, W) of the image that the user gave; None without one.
     """
 
     swath: Swath | None = None
@@ -99,23 +99,31 @@ class Bench(Table):
 
     @property
     def layers(self) -> list[Row]:
-        """Return the rows of the layers; they exist if one configuration was predicted."""
+        """Return the rows of the table of layers, with the time of each layer on the DPU.
+
+        The list is empty unless exactly one configuration of one board was predicted.
+        """
         return [row for row in self.rows if row.table == LAYERS]
 
 
 @dataclass(frozen=True)
 class Question:
-    """The options of a prediction by the cost model.
+    """The options of `bench` for a prediction by the cost model.
+
+    A swath is the long image that a satellite takes along its track.
 
     Attributes:
-        boards: configurations of the DPU.
-        corrections: tables that describe how the user's own runs correct the cost model.
+        boards: the DPU configurations to predict, of one or several boards.
+        corrections: titles and rows of tables that show how the user's measured runs correct the
+            cost model; empty without such runs.
         size: (width, height) of the swath in pixels; None for the paper's, or that of the image.
-        tiles_px: tile sides.
-        halo: "exact" or a number of pixels.
-        within_s: the time limit of the swath; None for no limit.
-        task: the task of the host; None derives it from the file.
-        consistency: True if the host computes the consistency step.
+        tiles_px: the sides in pixels of the tiles to predict.
+        halo: the pixels around a tile that are computed and discarded: "exact" for as many as the
+            network needs to leave no seams, or a number.
+        within_s: the time limit of the swath in s; None for no limit.
+        task: what the host does with the results; None derives it from the network's operators.
+        consistency: True if the host computes the consistency step, which makes block means of the
+            result agree with the raw image.
     """
 
     boards: Sequence[Dpu]
@@ -136,11 +144,16 @@ def bench_board(
     A network that cannot be tiled is predicted per frame, without a swath.
 
     Args:
-        network: float or INT8.
-        asked: boards, tiles and swath.
-        dn: digital numbers (H, W) of the image that is the swath; None for a simulated one.
-        sensor: the sensor that a shipped network is conditioned on. With it, the exposures that the
-            image needs are counted; None counts none.
+        network: the network, in float or INT8.
+        asked: the options: boards, tiles and swath.
+        dn: digital numbers (H, W) of an image to use as the swath; None for a swath of which only
+            the size is known.
+        sensor: the sensor that a shipped network is conditioned on. With it and `dn`, tiles count
+            once for each exposure (factor of brightness) that their pixels need. None counts each
+            tile once.
+
+    Returns:
+        The table of `bench`.
 
     Raises:
         ModelError: the network does not run on the DPU, or it cannot be tiled although a size, an
@@ -195,9 +208,9 @@ def bench_board(
 
 
 def _counted_alike(network: Network, asked: Question, swath: Swath) -> list[Row]:
-    """Return the swath in tiles as the paper counts them, to stand next to the paper's run.
+    """Predict the swath in tiles as the paper counts them, for comparison with the paper's run.
 
-    Whole tiles with a halo are more work than the paper counts: their time is no match for its.
+    Whole tiles with a halo are more work than the paper counts, so their time is not comparable.
     """
     boards = {dpu.name: dpu for dpu in asked.boards if dpu.target.name == PAPER_TARGET}
     first = next(iter(boards.values()))
@@ -209,7 +222,7 @@ def _counted_alike(network: Network, asked: Question, swath: Swath) -> list[Row]
 def _table(
     network: Network, boards: Sequence[Dpu], tables: Tables, notes: Sequence[str], **more: Any
 ) -> Bench:
-    """Return tables with titles as one table."""
+    """Join tables with titles to the one table that `bench` returns."""
     rows = list(chain.from_iterable(part for _, part in tables))
     headings = {part[0].table: title for title, part in tables if part}
     first = rows[0].table
@@ -229,7 +242,9 @@ POOR = 0.15
 
 
 def poor_words(boards: Sequence[Dpu]) -> list[str]:
-    """Return a sentence for each board whose cost model was fitted to few data."""
+    """Return a sentence for each board whose cost model is imprecise, because it is fitted to few
+    published rates. A table's heading ends with them.
+    """
     errors = {dpu.target.name: dpu.value("cost", "error_left_out") for dpu in boards}
     return [
         f"Of {name} little is known: networks left out of the fit are off by {error:.0%}"
@@ -239,7 +254,14 @@ def poor_words(boards: Sequence[Dpu]) -> list[str]:
 
 
 def fitted_words(rows: Sequence[Row]) -> list[str]:
-    """Return a sentence for each prediction outside the range that the cost model was fitted on."""
+    """Warn of predictions outside the range of the networks that the cost model was fitted to.
+
+    Args:
+        rows: rows of predictions, whose text "fitted range" is "inside" or says what is outside.
+
+    Returns:
+        A sentence for each text other than "inside", with the names of its rows.
+    """
     ranges: dict[str, list[str]] = {}
     for row in rows:
         words = row.text.get("fitted range", "inside")
@@ -249,7 +271,14 @@ def fitted_words(rows: Sequence[Row]) -> list[str]:
 
 
 def exposure_words(counts: Mapping[int, int]) -> list[str]:
-    """Return a sentence with the share of the tiles for each exposure, if there are several."""
+    """Describe how often a network runs at each exposure.
+
+    Args:
+        counts: the number of runs by exposure factor, by which dark pixels are multiplied.
+
+    Returns:
+        A list of one sentence with the shares; empty if there are fewer than two factors.
+    """
     if len(counts) < 2:
         return []
     total = sum(counts.values())
@@ -264,7 +293,7 @@ def _layers(network: Network, prediction: Prediction) -> tuple[str, list[Row]]:
 
 
 def _frames(network: Network, asked: Question, why: ModelError) -> Bench:
-    """Return the network on whole images; of one configuration each layer too."""
+    """Predict a network that runs on whole images. For one configuration, list each layer too."""
     # A network that is fixed to one size runs at that size alone.
     size_px = None if own_tile_px(network.model) else TILE_PX
     predictions = [predict_network(network, dpu, size_px, asked.task) for dpu in asked.boards]
@@ -281,7 +310,12 @@ def _frames(network: Network, asked: Question, why: ModelError) -> Bench:
 
 
 def quoted(network: Network, target: TargetProfile) -> Bench:
-    """Return the figures that the maker of a board publishes, for a board without a cost model."""
+    """Return published figures of other networks, for a board that the cost model cannot predict.
+
+    Args:
+        network: the network, whose own figures are reported as unavailable.
+        target: a board for which too few rates are published to fit a cost model.
+    """
     title = (
         f"{network.input.name} on {target.name}: nothing is predicted; other networks are published"
     )
@@ -295,12 +329,16 @@ def quoted(network: Network, target: TargetProfile) -> Bench:
 def boards_for(
     targets: Sequence[TargetProfile], config: str | None, measured: Path | None
 ) -> tuple[list[Dpu], Tables]:
-    """Return the configurations of boards, and tables of the runs that correct them.
+    """Select the DPU configurations that `bench` predicts, corrected by the user's measurements.
 
     Args:
         targets: the boards.
-        config: a configuration, "all" of each board, or None for the default.
-        measured: the user's own runs on the board, as JSON.
+        config: the name of a configuration, "all" for all of each board, or None for the default.
+        measured: a JSON file of runs that the user measured on the board; None without them.
+
+    Returns:
+        The configurations, and the titles and rows of tables that compare the runs with their
+        predictions (empty without runs).
 
     Raises:
         OptionError: one configuration for all boards, or runs for several.

@@ -39,13 +39,17 @@ def preview_row(
     reading: Reading,
     target: TargetProfile,
 ) -> Row:
-    """Return the facts of an image and of its restoration.
+    """Describe what `restore` would do to an image, and predict how long it would take.
 
     Args:
-        image: its file.
-        pipeline: the pipeline that would restore it.
-        reading: how its pixels would be understood.
+        image: the image file.
+        pipeline: the network and options that would restore it.
+        reading: the options by which its pixels are interpreted, such as full scale.
         target: the board whose time is predicted.
+
+    Returns:
+        A row with the size, the tiles, the predicted times here and on the board, the faults of
+        detectors that were found, and where the image lies.
     """
     network = next(iter(pipeline.networks.values()))
     with open_raster(image, reading.force) as source:
@@ -84,7 +88,12 @@ def preview_row(
 
 
 def header_scale(name: str, raster: Raster, reading: Reading) -> FullScale | str:
-    """Return the full scale that the file's header and the options determine.
+    """Determine full scale, the pixel value that is 1.0 to a network, without reading pixels.
+
+    Args:
+        name: the name of the file, for messages.
+        raster: the facts of the file's header.
+        reading: the options of the user.
 
     Returns:
         The full scale, or as text the reason why only the pixels can decide it.
@@ -102,7 +111,11 @@ def header_scale(name: str, raster: Raster, reading: Reading) -> FullScale | str
 
 
 def place_words(raster: Raster) -> Mapping[str, str]:
-    """Return where the image lies, in words."""
+    """Return the georeference of an image in words: coordinate system, first corner, pixel size.
+
+    Returns:
+        The texts "georeference" and "rational polynomials" of a row, each "none" if absent.
+    """
     place = raster.place
     words = "none"
     if place.crs or place.transform or place.gcps:
@@ -120,10 +133,18 @@ def place_words(raster: Raster) -> Mapping[str, str]:
 
 
 def time_here(network: Network, plan: Plan, engine: Engine) -> Figure:
-    """Predict the time of all tiles on this machine from the tiles that are timed here. Reading and
-    writing run in parallel.
+    """Predict the time of all tiles on this machine, from RUNS timed runs of one tile of noise.
 
-    The interval is of the quickest and the slowest of the runs.
+    Reading and writing are not counted, because they run in parallel.
+
+    Args:
+        network: the network.
+        plan: the tiles of the image.
+        engine: the runtime and the number of threads.
+
+    Returns:
+        The time in s from the median of the runs. The ends of its interval come from the quickest
+        and the slowest run.
     """
     at_once = tiles_at_once(engine.threads, plan.tiles)
     infer, runtime = open_runtime(engine.runtime, network.model, engine.threads)
@@ -142,10 +163,19 @@ def time_here(network: Network, plan: Plan, engine: Engine) -> Figure:
 
 
 def time_on_board(network: Network, plan: Plan, target: TargetProfile) -> Figure:
-    """Predict the time of all tiles on a board's DPU by the cost model, in whole batches and with
-    one exposure per tile.
+    """Predict the time of all tiles on a board's DPU by the cost model, in whole batches.
 
-    The host takes the consistency step where the network gives a pixel for each pixel.
+    Each tile counts once, as if no pixel needed a higher exposure. The board's processor computes
+    the consistency step (block means agree with the raw image) if the network retains the image
+    size and the bands.
+
+    Args:
+        network: the network.
+        plan: the tiles of the image.
+        target: the board, in its default configuration.
+
+    Returns:
+        The time in s; unavailable with the reason if the network does not run on the DPU.
     """
     step_px = (
         plan.height_px * plan.width_px * plan.bands / plan.tiles

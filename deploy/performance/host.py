@@ -28,7 +28,15 @@ from beers_deploy.quant.session import open_session, require_finite
 
 @dataclass
 class Timed:
-    """A network, and what its runs took."""
+    """A network with the measurements of its runs on this machine.
+
+    Attributes:
+        name: the name of the network in tables.
+        model: the network.
+        times_s: the time of each run in s.
+        powers: the mean power in W during each run; unavailable where no counter can be read.
+        held_bytes: the rise of this process's memory by opening the network and running it once.
+    """
 
     name: str
     model: onnx.ModelProto
@@ -42,14 +50,15 @@ def time_networks(
 ) -> None:
     """Time networks on a grey tile on this processor, and add the results to `runs`.
 
-    The runs are interleaved until each network has run for `min_time_s` and `min_runs` times.
+    The networks run in turn until each has run for `min_time_s` in total and `min_runs` times, so
+    that other load on the machine affects all of them alike.
 
     Args:
-        runs: the networks; they receive times, powers and memory.
-        tile_px: side of the tile.
-        threads: the threads of the runtime.
-        min_time_s: the shortest total time of a network's runs.
-        min_runs: the smallest number of them.
+        runs: the networks. Their times, powers and memory are filled in.
+        tile_px: side of the tile in pixels.
+        threads: the number of threads of onnxruntime; 0 for its default.
+        min_time_s: the shortest total time of a network's runs, in s.
+        min_runs: the smallest number of runs of a network.
     """
     calls = []
     for run in runs:
@@ -107,13 +116,22 @@ def host_rows(
     threads: int = 0,
     sensor: Sensor | None = None,
 ) -> list[Row]:
-    """Time a network for one tile through onnxruntime, float32 and INT8 interleaved, and return how
-    much faster INT8 is.
+    """Time a network for one tile on this machine, next to its counterpart in the other precision.
 
-    With a `sensor` the time of the consistency step is a row too.
+    The counterpart is the shipped network of the same architecture; if there is none, the network
+    runs alone. Both run in onnxruntime in turn, after one run of each for warm-up.
 
-    Each runs for the target's minimum time and count, one run for warm-up left out. Its pair in the
-    other precision is the shipped network of the same variant; without one it runs alone.
+    Args:
+        network: the network, in float32 or INT8.
+        target: the board whose file states the shortest time and the smallest number of runs.
+        tile_px: side of the tile in pixels.
+        threads: the number of threads; 0 for the default of onnxruntime.
+        sensor: a sensor whose consistency step, which makes block means of the result agree with
+            the raw image, is timed too; None for none.
+
+    Returns:
+        A row for each network with its median time (p50), 90th percentile, rate, power and memory;
+        the row of the step; and, with a counterpart, the ratio of float32 time to INT8 time.
     """
     require_cores("threads", threads)
     source = Network.load(network)
@@ -135,7 +153,16 @@ def host_rows(
 
 
 def step_row(sensor: Sensor, tile_px: int, min_time_s: float, min_runs: int) -> Row:
-    """Time the consistency step on one thread here, on a tile of noise."""
+    """Time the consistency step on one thread of this machine, on a tile of noise.
+
+    The step makes block means of a restored image agree with the raw image.
+
+    Args:
+        sensor: the sensor, whose blur the step uses.
+        tile_px: side of the tile in pixels.
+        min_time_s: the shortest total time of the runs, in s.
+        min_runs: the smallest number of runs.
+    """
     instrument = sensor.nominal()
     step = Consistency.of(instrument, sensor.reference.nominal())
     generator = np.random.default_rng(0)
@@ -154,5 +181,10 @@ def step_row(sensor: Sensor, tile_px: int, min_time_s: float, min_runs: int) -> 
 
 
 def conditions_of(threads: int) -> dict[str, Figure]:
-    """Return the conditions of a measurement since the last call of `cpu_load`."""
+    """Return the figures "threads" and "CPU load", which state how comparable a measured time is.
+
+    Args:
+        threads: the number of threads of the runtime. The load is that since the last call of
+            `cpu_load`, other processes included.
+    """
     return {"threads": measured(threads, "thread", "of the runtime"), "CPU load": cpu_load()}

@@ -30,18 +30,19 @@ PAPER_SIZE = "13600x9016"
 
 @dataclass(frozen=True)
 class Swath:
-    """The image that all rows describe, and the tiles it is cut into.
+    """The image that a benchmark describes, and the tiles it is cut into.
 
     Attributes:
-        width_px: the width of the image.
-        height_px: the height of the image.
-        tile_px: side of a tile.
-        halo_px: context around the part of a tile that is stored.
-        runs: mean number of runs of the network on a tile, one for each exposure that its pixels
-            need.
-        consistency: True if the host computes the consistency step.
-        detail: True if that step corrects finer detail too, as it does where the sensor's MTF
-            departs from the formula's curve.
+        width_px: the width of the image in pixels.
+        height_px: the height of the image in pixels.
+        tile_px: side of a tile in pixels, halo included.
+        halo_px: pixels at a tile's inner borders that are computed as context and discarded.
+        runs: mean number of runs of the network on a tile: one for each exposure, a factor of
+            brightness, that its pixels need.
+        consistency: True if the host computes the consistency step, which makes block means of the
+            result agree with the raw image.
+        detail: True if that step also corrects blocks of 2 x 2 pixels. It does so for a sensor
+            whose MTF has another curve than the usual formula.
     """
 
     width_px: int
@@ -59,18 +60,20 @@ class Swath:
 
     @property
     def frames(self) -> float:
-        """Return the number of tiles as the paper counts them: the pixels of the image over those
-        of a tile, a fraction, without halo.
+        """Return the number of tiles as the paper counts them: the pixels of the image divided by
+        those of a tile, a fraction, without halo.
 
-        13600 x 9016 at 640 is 299.4; at the published 7.2 frames a second that is the published 42
-        s.
+        For 13600 x 9016 pixels in tiles of 640 it is 299.4. At the published 7.2 frames a second
+        they take the published 42 s.
         """
         return self.pixels / self.tile_px**2
 
     @property
     def tiles(self) -> int:
-        """Return the number of whole tiles of the grid, whose last row and column are moved inward:
-        384 for the paper's swath with halo 35.
+        """Return the number of whole tiles that cover the image with their halos.
+
+        The last row and column are moved inward to stay in the image. It is 384 for the paper's
+        swath with halo 35.
         """
         rows, columns = (
             plan_side(side, self.tile_px, self.halo_px) for side in (self.height_px, self.width_px)
@@ -79,8 +82,10 @@ class Swath:
 
     @property
     def step_px(self) -> float:
-        """Return the number of pixels for which the host computes the consistency step, per run of
-        the network. With detail a pixel counts as the several that cost as much without it.
+        """Return the number of pixels of the consistency step for each run of the network.
+
+        If the step corrects finer detail too, a pixel counts as the number of pixels that take as
+        many operations without it. It is 0 without the step.
         """
         if not self.consistency:
             return 0.0
@@ -99,10 +104,13 @@ def predict_network(
 
     Args:
         network: the network, or its file or name.
-        dpu: the configuration.
-        tile_px: side of a tile; None for the size that the network is fixed to.
-        task: what the host does with the results; None derives it from the file.
+        dpu: the configuration of the DPU.
+        tile_px: side of a tile in pixels; None for the size that the network is fixed to.
+        task: what the host does with the results; None derives it from the network's operators.
         step_px: pixels of a tile for which the host computes the consistency step; 0 for no step.
+
+    Raises:
+        ModelError: the DPU does not run the network as a whole, or the network has no convolution.
     """
     source = Network.load(network, to_run=False)
     sized = network_of(source.model, tile_px, source.label)
@@ -112,13 +120,17 @@ def predict_network(
 def swath_figures(
     prediction: Prediction, swath: Swath, frames: float, batches: float
 ) -> dict[str, Figure]:
-    """Return the figures of a swath: latency, throughput, power, energy and others.
+    """Compute the figures of a swath from the prediction of a tile.
 
     Args:
         prediction: the prediction of the network for one tile size.
         swath: the image and its tiles.
-        frames: number of tiles, which may be a fraction.
-        batches: number of batches for them.
+        frames: the number of tiles, which may be a fraction.
+        batches: the number of batches that the DPU needs for all runs of these tiles.
+
+    Returns:
+        Latency in s, throughput in tiles a second, power in W, energy in J and further figures, by
+        the name of the column.
     """
     power = dpu_power(prediction.dpu)
     latency = swath_latency(prediction, batches)
@@ -143,13 +155,15 @@ def swath_figures(
 
 
 def throughput(prediction: Prediction) -> Figure:
-    """Return the predicted rate of the DPU and its host together, in tiles per second."""
+    """Return the predicted rate of the DPU and the host together, in tiles per second."""
     return predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE)
 
 
 def step_time(prediction: Prediction, swath: Swath) -> Figure:
-    """Return the time of the consistency step for the swath on the host's cores, in s. It runs
-    while the DPU works.
+    """Return the time of the consistency step for the whole swath, in s.
+
+    All cores of the board's processor compute the step while the DPU works, so the latency of the
+    swath does not grow by the whole of this time.
     """
     runs = swath.tiles * swath.runs
     low_s, high_s = (end_s * runs for end_s in prediction.step_s)
@@ -161,19 +175,19 @@ def step_time(prediction: Prediction, swath: Swath) -> Figure:
 
 
 def host_time(prediction: Prediction, unit: str) -> Figure:
-    """Return the time in ms that all cores of the host need for an image.
+    """Return the time in ms that all cores of the host need for one input of the network.
 
     Args:
         prediction: the prediction of the network.
-        unit: the unit that the figure states.
+        unit: the unit that the figure states, "ms/tile" or "ms/frame".
     """
     low_s, high_s = prediction.host_interval_s
     return predicted(1e3 * prediction.host_s, unit, (1e3 * low_s, 1e3 * high_s), COST_SOURCE)
 
 
 def one_thread_latency(prediction: Prediction) -> Figure:
-    """Return the time from image to result in ms if one thread runs one core's batch and then the
-    host's work.
+    """Return the time in ms from input to result if one thread runs a batch on one core of the DPU,
+    and then the host's work for it.
     """
     low_s, high_s = prediction.latency_interval_s
     handlers = prediction.dpu.handlers
@@ -184,7 +198,13 @@ def one_thread_latency(prediction: Prediction) -> Figure:
 
 
 def swath_latency(prediction: Prediction, batches: float) -> Figure:
-    """Return the time of a number of batches, in seconds."""
+    """Predict the time in s that a DPU and its host need for a number of batches.
+
+    Args:
+        prediction: the prediction of the network. A batch is the images that the DPU computes at
+            once.
+        batches: the number of batches, which may be a fraction.
+    """
     images = batches * prediction.batch
     # The lower end of the rate is the upper end of the time.
     slow_s, fast_s = (images / fps for fps in prediction.fps_interval)
@@ -192,9 +212,11 @@ def swath_latency(prediction: Prediction, batches: float) -> Figure:
 
 
 def fitted_range(prediction: Prediction) -> str:
-    """Return text that states whether the network is within the range of the fitted networks.
+    """State whether a network is within the range of those that the cost model was fitted to.
 
-    If the intervals of the board held too rarely, it also states how often they did.
+    Returns:
+        "inside", or "outside" with the properties. If the board's intervals contained fewer than
+        HELD of the families of networks that were left out of the fit, the text adds the share.
     """
     words = f"outside: {'; '.join(prediction.outside)}" if prediction.outside else "inside"
     share = prediction.dpu.value("cost", "families_held")
@@ -204,12 +226,18 @@ def fitted_range(prediction: Prediction) -> str:
 
 
 def energy(latency: Figure, power: Figure) -> Figure:
-    """Return the energy of the swath in J."""
+    """Return the energy in J of a run, from its time in s and its power in W."""
     return _of_time_and_power(latency, power, "J", mul)
 
 
 def efficiency(pixels: int, latency: Figure, power: Figure) -> Figure:
-    """Return the pixels per second and watt."""
+    """Return the pixels per second and watt.
+
+    Args:
+        pixels: the number of pixels of the image.
+        latency: the time of the image in s.
+        power: the power in W.
+    """
     return _of_time_and_power(
         latency, power, "px/s/W", lambda time_s, power_w: pixels / time_s / power_w
     )
@@ -229,7 +257,7 @@ def _of_time_and_power(
 
 
 def interval_ends(figure: Figure) -> Interval:
-    """Return the interval of a figure, or its value twice if it has none."""
+    """Return the interval of a figure; (value, value) if it has none, with 0 for no value."""
     return figure.interval or (figure.value or 0.0, figure.value or 0.0)
 
 
@@ -238,7 +266,7 @@ def pipeline_rate(swath: Swath, latency: Figure) -> Figure:
 
     Args:
         swath: the image and its tiles.
-        latency: the predicted time of the swath.
+        latency: the predicted time of the swath in s.
     """
     low, high = (swath.frames / end_s for end_s in reversed(interval_ends(latency)))
     return predicted(
@@ -249,19 +277,35 @@ def pipeline_rate(swath: Swath, latency: Figure) -> Figure:
 def exact(
     value: float, unit: str, source: str = "arithmetic of the graph's shapes, one image"
 ) -> Figure:
-    """Return a figure that follows from shapes alone."""
+    """Build a figure that follows from shapes alone, so that its interval has no width."""
     return predicted(value, unit, (value, value), source)
 
 
 def scaled(value: float, unit: str, prediction: Prediction) -> Figure:
-    """Return a part of the prediction as a figure with the relative error of the whole."""
+    """Build a figure for a part of a prediction, such as the time of a layer.
+
+    Args:
+        value: the value of the part.
+        unit: its unit.
+        prediction: the whole prediction, whose relative error the part is given.
+    """
     return predicted(
         value, unit, (value / prediction.spread, value * prediction.spread), COST_SOURCE
     )
 
 
 def parse_size(size: str | tuple[int, int]) -> tuple[int, int]:
-    """Return (width, height) in pixels, from a pair or from text WIDTHxHEIGHT."""
+    """Parse the option `size` of `bench`.
+
+    Args:
+        size: a pair (width, height) in pixels, or text WIDTHxHEIGHT.
+
+    Returns:
+        (width, height) in pixels.
+
+    Raises:
+        OptionError: the text has another form, or a side is not from 1 to SIDE_PX.
+    """
     text = size if isinstance(size, str) else "x".join(map(str, size))
     parts = text.lower().split("x")
     # Python raises an error of its own for very long numbers, so these are refused by their length.

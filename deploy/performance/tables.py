@@ -49,7 +49,16 @@ PAPER_TARGET = "vck190"
 
 
 def predicted_rows(name: str, prediction: Prediction, swath: Swath) -> list[Row]:
-    """Return two rows of a network on the DPU: counted as the paper counts, and in whole tiles."""
+    """Return the figures of a network on the DPU for a swath as two rows.
+
+    The first counts tiles as the paper does, the number of pixels over those of a tile. The second
+    counts whole tiles with their halo, as `restore` runs them.
+
+    Args:
+        name: the name of the network.
+        prediction: the prediction for one tile.
+        swath: the image and its tiles.
+    """
     batches = math.ceil(swath.tiles * swath.runs / prediction.batch)
     counts = {
         "as the paper counts": (swath.frames, swath.frames * swath.runs / prediction.batch),
@@ -74,8 +83,14 @@ figure's name and unit.
 
 
 def quoted_rows(network: str, target: TargetProfile) -> list[Row]:
-    """Return a network on a board without a cost model as unavailable, and the published figures of
-    other networks on that board.
+    """Return rows for a board that the cost model cannot predict.
+
+    Args:
+        network: the name of the user's network, whose figures are unavailable.
+        target: the board.
+
+    Returns:
+        The row of the network, then a row for each published figure of another network.
     """
     reason = f"too few rates of {target.name} are published to fit a cost model"
     figures = {key: unavailable(unit, reason) for key, unit in QUOTED.items()}
@@ -89,8 +104,8 @@ def quoted_rows(network: str, target: TargetProfile) -> list[Row]:
 
 
 def published_rows() -> list[Row]:
-    """Return the paper's two runs on the VCK190 as printed. It does not name the configuration of
-    the DPU.
+    """Return the two runs on the VCK190 that the paper printed: the traditional pipeline on the
+    processor, and ConvBEERS on the DPU, whose configuration it does not name.
     """
     runs = {
         "paper, 13600 x 9016: traditional on the VCK190's CPU": (1724, 0.2, 22.5, 3161),
@@ -106,9 +121,14 @@ def published_rows() -> list[Row]:
 
 
 def processor_row(swath: Swath, board: TargetProfile) -> Row:
-    """Return the traditional pipeline on the board's own processor.
+    """Predict the traditional pipeline on the board's own processor, for comparison with a DPU.
 
-    Its time is scaled by the number of pixels, from the time of 10^6 pixels in the board's file.
+    The time is that of 10^6 pixels in the board's file, scaled by the number of pixels. Figures
+    that the file does not state are unavailable.
+
+    Args:
+        swath: the image.
+        board: the board.
     """
     cpu = board.tables.get("cpu", {})
     mpx = swath.pixels / 1e6
@@ -136,10 +156,10 @@ def processor_row(swath: Swath, board: TargetProfile) -> Row:
 
 
 def layer_rows(prediction: Prediction) -> list[Row]:
-    """Return a row for each layer, and a last one with the sum of their times.
+    """Return a row for each layer on the DPU, and a last one with the sum of their times.
 
-    The columns are those of AMD's vaitrace, and in addition what limits the layer. Bytes are those
-    of one image.
+    The columns are those of AMD's profiler vaitrace, and a text "bound" with the longest part of
+    the layer's time. Times are those of a batch, bytes of feature maps those of one image.
     """
     rows = [_layer_row(layer, prediction) for layer in prediction.layers]
     total = f"sum: one batch of {prediction.batch}"
@@ -181,7 +201,18 @@ def sweep_rows(
     tiles_px: Sequence[int],
     task: Task | None = None,
 ) -> list[Row]:
-    """Return a row for each configuration and tile size, in whole tiles with the swath's halo."""
+    """Predict a swath for every combination of a configuration and a tile size.
+
+    Args:
+        network: the network.
+        swath: the image; its halo is used for all tile sizes.
+        boards: the DPU configurations.
+        tiles_px: the sides of the tiles in pixels.
+        task: what the host does with the results; None derives it from the network's operators.
+
+    Returns:
+        A row for each combination: all tile sizes of the first configuration, then of the next.
+    """
     rows = []
     for dpu, tile_px in product(boards, tiles_px):
         tiled = replace(swath, tile_px=tile_px)
@@ -191,7 +222,7 @@ def sweep_rows(
 
 
 def swath_row(prediction: Prediction, swath: Swath) -> Row:
-    """Return the swath in whole tiles on one configuration."""
+    """Return the predicted figures of a swath, in whole tiles, as one row of a sweep."""
     batches = math.ceil(swath.tiles * swath.runs / prediction.batch)
     on_chip = [not layer.work.map_bytes for layer in prediction.layers]
     figures = swath_figures(prediction, swath, swath.tiles, batches) | {
@@ -207,7 +238,7 @@ def swath_row(prediction: Prediction, swath: Swath) -> Row:
 
 
 def named(dpu: Dpu) -> str:
-    """Return the names of the board and of the configuration."""
+    """Return the names of the board and of its configuration, such as "vck190 C32B3"."""
     return f"{dpu.target.name} {dpu.name}"
 
 
@@ -219,9 +250,9 @@ def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) ->
     file states.
 
     Args:
-        rows: as `sweep_rows` returns them, with the same number of rows for each board in turn.
-        boards: as passed to `sweep_rows`.
-        within_s: the time limit of the swath.
+        rows: the rows of `sweep_rows`, the same number for each configuration in turn.
+        boards: the configurations that were passed to `sweep_rows`.
+        within_s: the time limit of the swath in s.
     """
     rows_per_board = len(rows) // len(boards)
     names = dict[str, str]()
@@ -247,7 +278,10 @@ def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) ->
 
 
 def frame_row(prediction: Prediction) -> Row:
-    """Return the row of a network that runs on whole images: per frame instead of per swath."""
+    """Return the predicted figures of a network that runs on whole images, not on tiles.
+
+    Times, rates and energy are those of one image (a frame).
+    """
     power = dpu_power(prediction.dpu)
     frame_s = swath_latency(prediction, 1 / prediction.batch)
     figures = {
@@ -264,8 +298,8 @@ def frame_row(prediction: Prediction) -> Row:
 
 
 def host_words(prediction: Prediction) -> list[str]:
-    """Return sentences about what was assumed of the file, and what the processor runs because the
-    DPU refuses it.
+    """Return notes on a prediction: what was assumed of a float file, and which nodes the board's
+    processor runs because its DPU refuses them.
     """
     sentences = list(filter(None, [prediction.note]))
     if prediction.refused:
@@ -281,7 +315,14 @@ def host_words(prediction: Prediction) -> list[str]:
 
 
 def parse_tiles(tile: int | str | Sequence[int]) -> list[int]:
-    """Return tile sides in pixels, from one side, several, or text with commas between them."""
+    """Parse the option `tile` of `bench`.
+
+    Args:
+        tile: one side in pixels, a sequence of sides, or text with commas between them.
+
+    Raises:
+        OptionError: a side is not an integer from 16 to MOST_TILE_PX.
+    """
     parts: Sequence[int | str] = [tile] if isinstance(tile, int) else tile
     if isinstance(tile, str):
         parts = tile.split(",")

@@ -18,8 +18,15 @@ Result = TypeVar("Result")
 
 
 def timed(work: Callable[[], Result], powercap: Path = POWERCAP) -> tuple[Result, float, Figure]:
-    """Run some work, and return its result, its wall time in seconds, and the mean power of the
-    processor packages.
+    """Run some work once, and measure its wall time and the mean power of the processor.
+
+    Args:
+        work: the function to run.
+        powercap: the folder of the energy counters (RAPL) of Linux.
+
+    Returns:
+        The result of `work`, its wall time in s, and the power in W of all processor packages,
+        unavailable if there are no counters.
     """
     before = _read(powercap)
     start = time.perf_counter()
@@ -64,12 +71,13 @@ def _read(powercap: Path) -> dict[Path, int] | str:
 def interleaved(
     calls: Sequence[Callable[[], object]], rounds: int, least_s: float = 0.0
 ) -> list[list[tuple[float, Figure]]]:
-    """Time several calls in turn, once per round.
+    """Time several calls in turn, once per round, so that other load affects all of them alike.
 
     Args:
         calls: the functions to time, already warmed up.
-        rounds: the least number of rounds.
-        least_s: the least total time of each call. Rounds are added until it is reached.
+        rounds: the smallest number of rounds.
+        least_s: the shortest total time of each call in s. Rounds are added until every call has
+            reached it.
 
     Returns:
         For each call, the time in s and the power of each round.
@@ -86,30 +94,37 @@ def interleaved(
 
 
 def cpu_load() -> Figure:
-    """Measure the load of all CPUs since the last call in this process, others included."""
+    """Measure the load in % of all CPUs since the last call in this process.
+
+    Other processes are included. Call this once before the work to begin the window, and ignore
+    that result.
+    """
     return measured(
         psutil.cpu_percent(), "%", "all CPUs over the same window, other processes included"
     )
 
 
 def own_cpu_s() -> float:
-    """Return the CPU time of this process, in seconds."""
+    """Return the CPU time of this process so far, user and system, in s."""
     times = psutil.Process().cpu_times()
     return float(times.user + times.system)
 
 
 def load_of_others(load: Figure, own_s: float, elapsed_s: float) -> float:
-    """Return the share of all CPUs that other processes took.
+    """Compute the share of all CPUs that other processes used during a window of time.
 
     Args:
-        load: the load of all CPUs over a window.
-        own_s: CPU time of this process over it.
-        elapsed_s: length of the window.
+        load: the load of all CPUs in % over the window, as `cpu_load` returns it.
+        own_s: the CPU time of this process over the window, in s.
+        elapsed_s: the length of the window in s.
+
+    Returns:
+        The share in [0, 1], 0 if this process used all of the load.
     """
     cpus = psutil.cpu_count() or 1
     return max((load.value or 0.0) / 100 - own_s / (cpus * max(elapsed_s, 1e-9)), 0.0)
 
 
 def resident_bytes() -> int:
-    """Return the resident memory of this process."""
+    """Return the resident memory of this process in bytes."""
     return int(psutil.Process().memory_info().rss)

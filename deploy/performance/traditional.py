@@ -30,10 +30,11 @@ class PipelineTime:
     """The measured time and power of the traditional pipeline on this machine.
 
     Attributes:
-        s_per_mpx: time in s for 10^6 pixels, of each crop.
-        power: the power of this processor while it ran.
-        conditions: threads and CPU load.
-        crop: size of the crops, for the source of the figures.
+        s_per_mpx: the time of each crop in s for 10^6 pixels.
+        power: the mean power of this processor in W while the pipeline ran.
+        conditions: the figures "threads" and "CPU load".
+        crop: the size of the crops in words, for the source of the figures.
+        others: the share of all CPUs in [0, 1] that other processes used meanwhile.
     """
 
     s_per_mpx: list[float]
@@ -41,12 +42,12 @@ class PipelineTime:
     conditions: dict[str, Figure]
     crop: str
     others: float
-    """Share of all CPUs that other processes took meanwhile."""
 
     def row(self, swath: Swath) -> Row:
-        """Return the row of a swath, scaled from the crops by the number of pixels.
+        """Predict the pipeline's figures for a whole image on this machine, as a row of `bench`.
 
-        The interval is given by the fastest and the slowest crop.
+        The time is that of the median crop, scaled by the number of pixels. Its interval reaches
+        from the fastest to the slowest crop.
         """
         median = statistics.median(self.s_per_mpx)
         mpx = swath.pixels / 1e6
@@ -65,7 +66,15 @@ class PipelineTime:
 
 
 def measure_pipeline(dn: np.ndarray, degraded: Sensor, reference: Sensor) -> PipelineTime:
-    """Time the pipeline on crops of digital numbers (H, W), after one small run for warm-up."""
+    """Time the traditional pipeline (denoise, then deconvolve) on CROPS crops of an image.
+
+    A small run for warm-up is not counted.
+
+    Args:
+        dn: the image in digital numbers (H, W).
+        degraded: the sensor that acquired the image.
+        reference: the better sensor that is the target of the deconvolution.
+    """
     pipeline = TraditionalPipeline(degraded.nominal(), reference.nominal())
     crops = [torch.from_numpy(np.ascontiguousarray(crop, dtype=np.float32)) for crop in _crops(dn)]
     restore_traditional(crops[0][:32, :32], pipeline)
@@ -86,8 +95,17 @@ def measure_pipeline(dn: np.ndarray, degraded: Sensor, reference: Sensor) -> Pip
 def drawn_acquisition(
     swath: Swath, degraded: Sensor, reference: Sensor, seed: int = 0
 ) -> np.ndarray:
-    """Simulate the digital numbers of a drawn scene, as large as the swath but not larger than the
-    crops need.
+    """Simulate an image to time the pipeline on, if the user gives none.
+
+    Args:
+        swath: the image that the benchmark describes. The result is as large, but not larger than
+            the crops of `measure_pipeline` need.
+        degraded: the sensor of the image.
+        reference: the better sensor, which the simulator needs for a pair.
+        seed: the seed of the scene and of the noise.
+
+    Returns:
+        Digital numbers (H, W).
     """
     ratio = int(degraded.oversampling.low)
     sides = min(swath.height_px, CROP_PX), min(swath.width_px, CROPS * CROP_PX)

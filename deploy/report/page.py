@@ -18,7 +18,10 @@ INTERVAL = re.compile(r"\[[^\[\]]*\]")
 
 
 def template(name: str) -> jinja2.Template:
-    """Return a template of this folder, which escapes the values inserted into it."""
+    """Load a jinja2 template of this folder, such as "report.html".
+
+    Values that are inserted into it are escaped, and an undefined name raises an error.
+    """
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     # A name that the template misspells raises an error instead of writing nothing.
     strict = jinja2.StrictUndefined
@@ -54,7 +57,13 @@ WIDE = 8
 
 @dataclass(frozen=True)
 class Section:
-    """A table of the report, with a sentence on how to read it."""
+    """A table of a report.
+
+    Attributes:
+        title: the heading above the table.
+        rows: the rows of the table.
+        caption: a sentence on how to read the table; empty for none.
+    """
 
     title: str
     rows: Sequence[Row]
@@ -63,7 +72,13 @@ class Section:
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture as a data: address, with its title and caption."""
+    """A picture of a report.
+
+    Attributes:
+        title: the heading above the picture.
+        source: the picture itself as a data: address.
+        caption: a sentence below the picture.
+    """
 
     title: str
     source: str
@@ -72,7 +87,17 @@ class Picture:
 
 @dataclass(frozen=True)
 class Report:
-    """The content of a page, in reading order."""
+    """The content of an HTML page, in reading order.
+
+    Attributes:
+        title: the title of the page.
+        headline: the result, in one or two sentences.
+        tables: the tables.
+        pictures: the pictures.
+        notes: sentences that a reader of the figures must know.
+        sorts: True if a click on a heading sorts its table. Rows are then never turned into
+            columns.
+    """
 
     title: str
     headline: str
@@ -80,17 +105,16 @@ class Report:
     pictures: Sequence[Picture]
     notes: Sequence[str]
     sorts: bool = False
-    """If True, a click on a heading sorts its table."""
 
 
 def render(report: Report) -> str:
-    """Render the report as one HTML file with embedded pictures."""
+    """Render a report as the text of one HTML file, with its pictures embedded."""
     tables = [_grid(table, upright=report.sorts) for table in report.tables]
     return template("report.html").render(report=report, tables=tables, version=__version__)
 
 
 def write_report(report: Report, path: Path) -> None:
-    """Write the page, atomically."""
+    """Write a report as one HTML file, atomically."""
     write_text(path, render(report))
 
 

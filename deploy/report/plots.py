@@ -94,8 +94,8 @@ LOOK = {
 
 @contextmanager
 def look() -> Iterator[None]:
-    """Apply the style of our plots to everything drawn and saved within, independent of the user's
-    own matplotlib style.
+    """Use the style of this package's plots for all that matplotlib draws and saves within the
+    `with` block, whatever style the user has set.
     """
     from matplotlib import style
 
@@ -107,7 +107,7 @@ def look() -> Iterator[None]:
 
 
 def new_figure(width_px: float, height_px: float) -> "Figure":
-    """Return an empty figure of that size, for use within `look`."""
+    """Return an empty matplotlib figure of a size in pixels. Call it within `look`."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_px / PX_PER_INCH, height_px / PX_PER_INCH), dpi=PX_PER_INCH)
@@ -118,7 +118,12 @@ LEAST_TICKS = 3
 
 
 def set_ticks(axis: "Axis", most: int) -> None:
-    """Place at most `most` ticks at round values within an axis' limits, and label them."""
+    """Replace the ticks of an axis by at most `most` labelled ones at round values.
+
+    Args:
+        axis: the x or y axis of a matplotlib plot, after its limits and scale are set.
+        most: the largest number of ticks.
+    """
     low, high = sorted(axis.get_view_interval())
     values = round_values(low, high, most, logarithmic=axis.get_scale() == "log")
     axis.set_ticks(values, labels=[number(value, 12) for value in values])
@@ -126,8 +131,14 @@ def set_ticks(axis: "Axis", most: int) -> None:
 
 
 def round_values(low: float, high: float, most: int, *, logarithmic: bool) -> list[float]:
-    """Return at most `most` round values from `low` to `high`. They are evenly spaced if a
-    logarithmic axis contains too few.
+    """Choose round values for the ticks of an axis.
+
+    Args:
+        low: the lower limit of the axis.
+        high: the upper limit of the axis.
+        most: the largest number of values.
+        logarithmic: True for a logarithmic axis. If its limits are too close for round values of a
+            logarithmic scale, the values are evenly spaced.
     """
     from matplotlib.ticker import LogLocator, MaxNLocator
 
@@ -155,12 +166,12 @@ XLINK = "http://www.w3.org/1999/xlink"
 
 
 def svg_of(figure: "Figure", name: str, titles: Mapping[str, str] | None = None) -> Markup:
-    """Return a figure as an SVG file that follows the reader's light or dark mode.
+    """Convert a matplotlib figure to SVG text that follows the reader's light or dark mode.
 
     Args:
-        figure: drawn within `look`, in colours of LIGHT.
-        name: the label for screen readers.
-        titles: the tooltips of the artists, by group id (`set_gid`).
+        figure: the figure, drawn within `look` in colours of LIGHT.
+        name: the label of the picture for screen readers.
+        titles: the tooltips of lines and points by group id, which `Artist.set_gid` sets.
     """
     stream = io.BytesIO()
     with look():
@@ -202,7 +213,7 @@ def _name(group: ET.Element, titles: Mapping[str, str]) -> None:
 
 
 def plot_style() -> str:
-    """Return the style sheet of plots with their colours, light and dark."""
+    """Return the CSS that sets the colour variables of the plots for light and dark screens."""
     light, dark = (
         " ".join(f"--{name}: {colour};" for name, colour in colours.items())
         for colours in (LIGHT, DARK)
@@ -214,14 +225,21 @@ def plot_style() -> str:
 
 
 def data_url(svg: str) -> str:
-    """Return an SVG file as a data: address."""
+    """Return SVG text as a data: address, which an HTML page can show without another file."""
     return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Points (x, y), with x above 0 on a logarithmic axis. Curves of one name look the same in all
-    panels.
+    """A line through points in a plot of `curves_svg`.
+
+    Curves of one name must have one colour and style, because they share an entry of the legend.
+
+    Attributes:
+        name: the name in the legend.
+        colour: the position of the colour in SERIES.
+        dashed: True for a dashed line.
+        points: the points (x, y) in order, with x above 0 on a logarithmic axis.
     """
 
     name: str
@@ -254,7 +272,7 @@ def curves_svg(
     """Draw panels side by side that share the y axis. Each has an x axis of its own.
 
     Args:
-        panels: curves that share axes, under a title.
+        panels: the title and the curves of each panel.
         x_title: the title of the x axis.
         y_title: the title of the y axis.
         logarithmic: if True, the x axis is logarithmic and each point has a dot; else only lines
@@ -310,8 +328,16 @@ MOST_BARS = 81
 
 
 def histogram_url(spread: "Spread") -> str:
-    """Draw the shares of pixels by error on a logarithmic scale, with a Gaussian of the same
-    deviation. Return a data: address.
+    """Draw a histogram of the INT8 error over all pixels, on a logarithmic scale.
+
+    A line shows a Gaussian of the same standard deviation: errors by rounding follow it, clipping
+    leaves bars outside it.
+
+    Args:
+        spread: the number of pixels by the difference of INT8 from float in DN.
+
+    Returns:
+        The picture as a data: address.
     """
     centres, shares, wide = bins(spread)
     # A share of one pixel is the least that a bar can have.
@@ -338,8 +364,14 @@ def histogram_url(spread: "Spread") -> str:
 
 
 def bins(spread: "Spread") -> tuple[np.ndarray, np.ndarray, int]:
-    """Return centres in DN, shares of the pixels, and the width in DN of at most MOST_BARS bins
-    that contain every error.
+    """Group the differences of INT8 from float into at most MOST_BARS bins for a histogram.
+
+    Args:
+        spread: the number of pixels by the difference in DN.
+
+    Returns:
+        The centres of the bins in DN, (n,); the shares of all pixels in [0, 1], (n,); and the width
+        of a bin in DN, which is odd, so that zero is in the middle of a bin.
     """
     farthest = int(np.abs(np.flatnonzero(spread.counts) - MAX_DN).max())
     # The width is odd, so that zero lies in the middle of a bin.

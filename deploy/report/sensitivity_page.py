@@ -37,15 +37,15 @@ def sensitivity_page(
     sessions: Sessions,
     worst: Sequence[int],
 ) -> Report:
-    """Compose the page of the histogram, the worst patches, and every table.
+    """Compose the page that shows where INT8 errs: a histogram, the worst patches, and tables.
 
     Args:
         headline: the result, in one or two sentences.
         rows: the rows of all tables, in reading order.
-        spread: the spread of the errors on the patches.
-        patches: samples that neither network was calibrated on.
-        sessions: the float and the INT8 network.
-        worst: the numbers of the patches to show.
+        spread: the differences of INT8 from float on `patches`, patch by patch.
+        patches: samples that were held out from calibration.
+        sessions: the float and the INT8 network, opened in onnxruntime.
+        worst: the numbers of the patches to show, counted from 0.
     """
     white_dn = next(dn for dn in range(1, MAX_DN + 1) if spread.share_beyond(dn) <= 1 - WHITE_SHARE)
     pictures = [Picture("Errors by size", histogram_url(spread), HISTOGRAM_CAPTION)]
@@ -58,7 +58,14 @@ def sensitivity_page(
 
 
 def worst_picture(number: int, patches: Patches, sessions: Sessions, white_dn: float) -> Picture:
-    """Draw one patch as given, in float and in INT8, and the absolute difference."""
+    """Draw one patch and its results: the input, float, INT8, and the absolute difference.
+
+    Args:
+        number: the number of the patch, counted from 0.
+        patches: the patches.
+        sessions: the float and the INT8 network, opened in onnxruntime.
+        white_dn: the difference in DN that is shown white.
+    """
     patch = patches.degraded[number]
     degraded, in_float, in_int8 = (
         np.clip(to_shares(image, patches.ranges), 0, 1)[0, 0] * MAX_DN
@@ -121,13 +128,14 @@ GRADIENT = [{"stop": 0, "bgColor": "#ffffff"}, {"stop": 1, "bgColor": "#d73027"}
 
 
 def node_data(layers: Iterable[Row]) -> str:
-    """Return the share of the squared error of each node as JSON of one graph.
+    """Write the error of each layer as JSON that Google's Model Explorer colours a graph by.
 
-    The nodes in the float network, the host's file and the board's file have the layers' names, so
-    the same JSON colours all three.
+    Nodes have the same names in the float network, the INT8 file for onnxruntime and the file for
+    the board, so the same JSON colours all three.
 
     Args:
-        layers: rows with a single layer in int8; other rows are left out.
+        layers: rows of the errors with one layer in int8 and all others in float. Rows without the
+            share of the squared error are left out.
 
     Returns:
         JSON text as Model Explorer reads it, with the shares in percent by the node's name.

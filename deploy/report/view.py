@@ -28,14 +28,15 @@ VIEWER = Path(__file__).parent / "openseadragon"
 def write_view(
     path: Path, image: Path, restored: Path, maps: Mapping[str, Path], trusted: bool
 ) -> None:
-    """Write the view of a run, atomically.
+    """Write an HTML page that compares a raw image with its restoration, atomically.
 
     Args:
-        path: the path of the HTML file.
-        image: the raw image.
-        restored: the image that was made from it.
-        maps: further layers; see `layers_of`.
-        trusted: True if an index may name files outside its folder.
+        path: the HTML file to write.
+        image: the file of the raw image.
+        restored: the file of the restored image.
+        maps: files of further rasters of the same place by the name of their layer, such as the map
+            of the self-check; see `layers_of`.
+        trusted: True if `image` may be an index (such as a VRT) of files outside its folder.
     """
     layers, notes = layers_of(image, restored, maps, trusted)
     page = template("view.html").render(
@@ -66,9 +67,14 @@ def _described(layer: Layer, raw: Layer) -> dict[str, Any]:
 
 
 def pyramid(picture: Image.Image) -> list[list[list[str]]]:
-    """Return the tiles of a picture as data: addresses, by level, row and column.
+    """Cut a picture into tiles at several sizes, so that a viewer loads only what is visible.
 
-    Each level has half the size of the next. The first is a single tile, the last the picture.
+    Args:
+        picture: the picture at full size.
+
+    Returns:
+        The tiles as data: addresses, indexed by level, row and column. Each level has half the size
+        of the next. The first level is a single tile, the last the picture at full size.
     """
     levels = [picture]
     while max(levels[0].size) > TILE_PX:

@@ -60,13 +60,13 @@ Planes = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Layer:
-    """One layer of a view.
+    """One picture of the page that compares a raw and a restored image.
 
     Attributes:
-        name: as the page calls it.
-        pixels: (H, W) grey, (H, W, 3) colour, or (H, W, 4) colour with opacity.
-        pixel_px: columns of the raw image that one column covers.
-        legend: colours (CSS) and their meanings.
+        name: the name of the layer on the page.
+        pixels: uint8, (H, W) grey, (H, W, 3) colour, or (H, W, 4) colour with opacity.
+        pixel_px: the number of columns of the raw image that one column of `pixels` covers.
+        legend: colours (CSS) and what they mean.
     """
 
     name: str
@@ -78,14 +78,18 @@ class Layer:
 def layers_of(
     image: Path, restored: Path, maps: Mapping[str, Path], trusted: bool
 ) -> tuple[list[Layer], str]:
-    """Return the layers of a run, the raw image first, and sentences on how they were made.
+    """Read the pictures that a page shows of a restoration, reduced to SIDE_PX a side.
 
     Args:
-        image: the raw image.
-        restored: the image that was made from it.
-        maps: further rasters over the same place, by the name of the layer: SELF_CHECK is a map of
-            blocks, others are images.
-        trusted: True if an index may name files outside its folder.
+        image: the file of the raw image.
+        restored: the file of the restored image.
+        maps: files of further rasters of the same place, by the name of the layer. SELF_CHECK is
+            the map of the self-check, a state for each block of the image; others are images.
+        trusted: True if `image` may be an index (such as a VRT) of files outside its folder.
+
+    Returns:
+        The raw image, the restored image, their difference if they have one size, and the maps;
+        and sentences on how they are shown.
     """
     with ExitStack() as stack:
         raw = stack.enter_context(open_raster(image, trusted))
@@ -113,20 +117,23 @@ def layers_of(
 
 
 def reduction(raster: Raster) -> int:
-    """Return the integer factor by which an image is reduced to SIDE_PX a side."""
+    """Return the integer factor by which an image is reduced, so that no side exceeds SIDE_PX."""
     return -(-max(raster.height_px, raster.width_px) // SIDE_PX)
 
 
 def read_planes(source: Source, bands: Sequence[int], factor: int) -> Planes:
-    """Read bands, each pixel the mean of the known ones of a block of `factor` x `factor`.
+    """Read bands of an image, reduced by an integer factor.
+
+    Each pixel is the mean of a block of `factor` x `factor` pixels, without those that the file
+    marks as missing.
 
     Args:
         source: an open image.
-        bands: their numbers, from 0.
-        factor: the factor of the reduction.
+        bands: the numbers of the bands, from 0.
+        factor: the factor of the reduction; 1 for none.
 
     Returns:
-        (bands, H, W); NaN where a block has no known pixel.
+        float32 (bands, H, W); NaN where all pixels of a block are missing.
     """
     raster = source.raster
     rows_px = factor * max(1, STRIP_PX // (raster.width_px * raster.bands * factor))

@@ -13,12 +13,13 @@ LEGEND = "measured here, predicted by a model [interval], published in a documen
 
 @dataclass(frozen=True)
 class Column:
-    """One figure of all rows.
+    """A column of figures of a shown table, and what its heading can state for all rows.
 
     Attributes:
-        name: the name of the figure.
-        unit: the unit that its figures share; empty if they differ.
-        mode: likewise, of those that have a value.
+        name: the name of the figures, under which each row has one or none.
+        unit: the unit of the figures; empty if rows have different units.
+        mode: the mode of the figures that have a value, such as "measured"; empty if rows have
+            different modes.
     """
 
     name: str
@@ -27,7 +28,7 @@ class Column:
 
     @property
     def about(self) -> str:
-        """The unit and the mode that a heading states, separated by a comma."""
+        """The text for the heading: unit and mode, separated by a comma; empty without both."""
         return ", ".join(filter(None, (self.unit, self.mode)))
 
     def stated(self, figure: Figure) -> tuple[str, str]:
@@ -44,8 +45,10 @@ class Column:
         return " ".join(filter(None, (str(figure), unit))), "" if self.mode else figure.mode
 
     def text(self, row: Row) -> str:
-        """Return the text of a row's cell: empty without the figure, "-" if the figure has no
-        value.
+        """Return the text of one row's cell in this column.
+
+        It is the value, with unit and mode unless the heading states them; "" if the row has no
+        such figure, and "-" if the figure is unavailable.
         """
         figure = row.figures.get(self.name)
         if figure is None or figure.value is None:
@@ -54,7 +57,7 @@ class Column:
 
 
 def columns_of(rows: Sequence[Row]) -> list[Column]:
-    """Return a column for each figure that any row has, in their order."""
+    """Return a column for each name of a figure in any row, in the order of first appearance."""
     columns = []
     for name in dict.fromkeys(chain.from_iterable(row.figures for row in rows)):
         figures = [row.figures[name] for row in rows if name in row.figures]
@@ -70,13 +73,22 @@ def _common(words: Set[str]) -> str:
 
 
 def words_of(rows: Sequence[Row]) -> list[str]:
-    """Return the names of the text columns that any row has, in order."""
+    """Return the names of the texts in any row, in the order of first appearance.
+
+    A text is a word or sentence of a row that is no figure.
+    """
     return list(dict.fromkeys(chain.from_iterable(row.text for row in rows)))
 
 
 def missing(rows: Sequence[Row]) -> list[str]:
-    """Return a line for each reason why figures are missing, with the figures and rows
-    concerned.
+    """Explain the unavailable figures of a table, below the table.
+
+    Args:
+        rows: the rows of the table.
+
+    Returns:
+        A line for each reason: the names of the figures, the names of their rows (unless they are
+        half of all rows or more), and the reason.
     """
     keys_of: dict[tuple[str, str], list[str]] = {}
     for row in rows:

@@ -24,8 +24,18 @@ def _index(rows: Sequence[Row]) -> Any:
 
 
 def wide_frame(rows: Sequence[Row]) -> "pd.DataFrame":
-    """Return a line for each row, with a column for each figure and for each word; `attrs["units"]`
-    has the units.
+    """Convert rows to a pandas DataFrame with a line for each row; see `results.Table.to_pandas`.
+
+    Args:
+        rows: the rows of one or several tables.
+
+    Returns:
+        A float column for each figure (NaN if unavailable) and a text column for each text.
+        `attrs["units"]` is a dict from the name of a figure to its unit. The index is the name of
+        the row, with the name of the table before it if there are several tables.
+
+    Raises:
+        MissingExtraError: pandas is not installed.
     """
     pandas = optional("pandas", "to_pandas")
     columns = columns_of(rows)
@@ -44,8 +54,15 @@ def wide_frame(rows: Sequence[Row]) -> "pd.DataFrame":
 
 
 def tidy_frame(rows: Sequence[Row]) -> "pd.DataFrame":
-    """Return a line for each figure: its table, row and name, value, unit, mode, interval and
-    source (or the reason why it is missing).
+    """Convert rows to a pandas DataFrame with a line for each figure; see
+    `results.Table.to_pandas`.
+
+    Returns:
+        The columns table, name (of the row), figure, value, unit, mode, low and high (the interval)
+        and source, or the reason if the figure is unavailable.
+
+    Raises:
+        MissingExtraError: pandas is not installed.
     """
     pandas = optional("pandas", "to_pandas")
     lines = []
@@ -69,7 +86,17 @@ def tidy_frame(rows: Sequence[Row]) -> "pd.DataFrame":
 
 
 def bars(rows: Sequence[Row], figure: str | None, ax: "Axes | None") -> "Axes":
-    """Draw bars of one figure, each with its interval; see `results.Table.plot`."""
+    """Draw a bar chart of one figure of the rows that have it; see `results.Table.plot`.
+
+    Args:
+        rows: the rows.
+        figure: the name of the figure; None for the first one.
+        ax: the matplotlib axes to draw on; None for new ones.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+        OptionError: the rows have no figures, or none of this name.
+    """
     names = [column.name for column in columns_of(rows)]
     if not names:
         raise OptionError("The table has no figures, so there is nothing to plot.")

@@ -11,10 +11,14 @@ STYLE = "border-bottom: 1px solid; padding: 2px 8px; text-align: left"
 
 
 def html_table(title: str, rows: Sequence[Row]) -> str:
-    """Return an HTML table with a line for each row.
+    """Render rows as an HTML table with a line for each row, for notebooks.
 
     Each figure is followed by its mode: measured, predicted or published. The tooltip of a figure
     is its source, or the reason why it is missing.
+
+    Args:
+        title: the heading of the column of names.
+        rows: the rows of the table.
     """
     columns = columns_of(rows)
     words = words_of(rows)

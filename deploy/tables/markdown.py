@@ -12,16 +12,18 @@ MARKUP = re.compile(r"[\\`*_\[\]<>&|]")
 
 
 def markdown_text(text: str) -> str:
-    """Return text escaped on one line, so that Markdown shows it literally. A layer's name comes
-    from a file.
+    """Escape text and put it on one line, so that Markdown shows it literally.
+
+    Names of layers come from files, which may contain markup.
     """
     return MARKUP.sub(lambda match: f"\\{match[0]}", one_line(text))
 
 
 def markdown_table(rows: Sequence[Row]) -> list[str]:
-    """Return the lines of one table, and of a list of reasons why figures are missing.
+    """Render rows as the lines of a Markdown table, and below it why figures are missing.
 
-    A heading states the unit and the mode of its column if they are the same in all rows.
+    A heading states the unit and the mode of its column if they are the same in all rows; otherwise
+    the cells state them.
     """
     columns = columns_of(rows)
     words = words_of(rows)

@@ -35,23 +35,25 @@ HEADING_WIDTH = 16
 
 
 def default_console() -> Console:
-    """Return standard output, wide enough for whole tables when it is a file or a pipe."""
+    """Return a console of rich on standard output, PIPE_WIDTH columns wide if that is no
+    terminal.
+    """
     console = Console()
     return console if console.is_terminal else Console(width=PIPE_WIDTH)
 
 
 def plain(text: str) -> Text:
-    """Return words on one line, literally: without markup, and without control characters."""
+    """Return text for rich to print literally on one line, without markup or control characters."""
     return Text(one_line(text))
 
 
 def print_rows(title: str, rows: Iterable[Row], console: Console) -> None:
-    """Print the rows of one table, and below it the reasons why figures are missing.
+    """Print one table in the best layout that fits, and below it why figures are missing.
 
     Args:
         title: the title of the table.
         rows: the rows of the table.
-        console: to print on.
+        console: the console of rich to print to, whose width decides the layout.
     """
     table_rows = list(rows)
     console.print(plain(title), style="bold", highlight=False)

@@ -195,7 +195,16 @@ def transposed_channels(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def alu_padding(op: Operation, dpu: Dpu, table: str) -> Finding | None:
-    """Check that the ALU engine can do the padding of a depthwise convolution or a pool."""
+    """Check that the ALU engine can do the padding of a depthwise convolution or a pool.
+
+    Args:
+        op: the operation.
+        dpu: the configuration of the DPU.
+        table: the table of the board's constants that has pad_begin and pad_end.
+
+    Returns:
+        The finding if a pad is outside the range, else None.
+    """
     # The ALU has a limit for top and left, which are the first two of ONNX, and one for the others.
     begin = dpu.limit(table, "pad_begin")
     end = dpu.limit(table, "pad_end")

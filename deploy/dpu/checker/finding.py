@@ -10,7 +10,12 @@ from beers_deploy.profiles.constant import Constant
 
 @dataclass(frozen=True)
 class Finding:
-    """The reason why a node cannot run on the DPU, and a remedy."""
+    """The result of a rule that a node breaks.
+
+    Attributes:
+        reason: why the node cannot run on the DPU, with the node's own values.
+        remedy: what to change in the network.
+    """
 
     reason: str
     remedy: str
@@ -24,19 +29,26 @@ Its docstring is the rule's text, in which {table[key]} stands for a limit.
 
 
 def outside(values: tuple[int, ...], limit: Constant) -> bool:
-    """Return True if any value lies outside the limit."""
+    """Return True if any of the values is below `limit.low` or above `limit.high`."""
     return any(not limit.low <= value <= limit.high for value in values)
 
 
 def shown(sides: tuple[int, int]) -> str:
-    """Format height and width (the order of ONNX) as sizes are shown everywhere: width x height."""
+    """Format (height, width), the order of ONNX, as text "WIDTH x HEIGHT"."""
     return f"{sides[1]} x {sides[0]}"
 
 
 def beyond_range(what: str, sides: tuple[int, int], limit: Constant, remedy: str) -> Finding | None:
-    """Return a finding if one side of a kernel or a stride lies outside the limit, else None.
+    """Check a kernel or a stride against the range that the DPU supports.
 
-    In the remedy, {most} stands for the largest side.
+    Args:
+        what: the name of the checked value in messages, such as "kernel".
+        sides: height and width.
+        limit: the range for either side.
+        remedy: what to change in the network, in which {most} stands for the largest side.
+
+    Returns:
+        The finding if a side lies outside the range, else None.
     """
     if not outside(sides, limit):
         return None
@@ -45,5 +57,5 @@ def beyond_range(what: str, sides: tuple[int, int], limit: Constant, remedy: str
 
 
 def groups_of(count: int, size: int) -> int:
-    """Return the number of groups of `size` that are needed for `count` items."""
+    """Return `count` / `size`, rounded up: the number of groups of `size` that hold all items."""
     return -(-count // size)

@@ -151,8 +151,10 @@ def same_scale(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def product_frac_bits(op: Operation) -> int | None:
-    """Return the fractional bits of a convolution's sums of products, or None if a scale is
-    missing.
+    """Return the number of fractional bits of a convolution's sums before the bias is added.
+
+    It is the sum of those of the weights and of the input, because products add them. Return None
+    if the scale of either is missing or no power of two.
     """
     weight = _frac_bits(op, "weight")
     source = _frac_bits(op, "input 0")

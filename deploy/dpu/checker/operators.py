@@ -101,7 +101,13 @@ SHIFTS: Mapping[Kind, tuple[Rule, ...]] = {
 
 @dataclass(frozen=True)
 class Broken:
-    """A rule that a node breaks, with its text and the finding."""
+    """A rule that a node breaks.
+
+    Attributes:
+        rule: the name of the rule, such as "conv kernel".
+        text: the text of the rule, with the limits of the board.
+        finding: why the node breaks it, and what to change.
+    """
 
     rule: str
     text: str
@@ -109,9 +115,18 @@ class Broken:
 
 
 def judge(op: Operation, dpu: Dpu, quantized: bool) -> tuple[Broken, ...]:
-    """Return every rule that a node breaks, or none if one of its `forms` breaks none.
+    """Check one operation against all rules for its kind.
 
-    The rules about numbers are checked only if the file is quantised.
+    A compiler may convert an operation to another form (`forms`), so it passes if one of its forms
+    breaks no rule.
+
+    Args:
+        op: the operation.
+        dpu: the device, with the limits of its rules.
+        quantized: True to check the rules about integers and scales too.
+
+    Returns:
+        The rules that the operation breaks as it is written; empty if it passes.
     """
     breaches = [_broken(form, dpu, quantized) for form in forms(op, dpu)]
     # The first form is the operation as the file has it: the report is about that one.
@@ -133,7 +148,6 @@ def _broken(op: Operation, dpu: Dpu, quantized: bool) -> tuple[Broken, ...]:
 
 def forms(op: Operation, dpu: Dpu) -> Iterator[Operation]:
     """Yield the operation as it is written, then the other forms that a compiler may convert it to.
-    Each is checked against the rules.
 
     A fully connected layer is a convolution as large as its map. It is also a 1 x 1 convolution
     over the flattened map: a matrix product becomes a convolution if that fits the hardware (UG1414
@@ -159,7 +173,9 @@ def forms(op: Operation, dpu: Dpu) -> Iterator[Operation]:
 
 
 def fully_connected(op: Operation) -> bool:
-    """Return True if a convolution is as large as its map, so that its result has one pixel."""
+    """Return True if an operation is a fully connected layer: a convolution whose kernel is as
+    large as its input, without pads and dilations, so that its result has one pixel.
+    """
     shape = op.in_shapes[0] if op.in_shapes else None
     return (
         op.kind == "conv"
@@ -171,14 +187,15 @@ def fully_connected(op: Operation) -> bool:
 
 
 def all_rules() -> Iterator[Rule]:
-    """Yield every rule once, in the order of the tables."""
+    """Yield every rule of any DPU once, in the order of RULES, EVERY, NUMBERS and SHIFTS."""
     tables = [*RULES.values(), EVERY, NUMBERS, *SHIFTS.values()]
     yield from dict.fromkeys(chain.from_iterable(tables))
 
 
 def require_known(dpu: Dpu) -> None:
-    """Raise an error for a constant that no rule names. A misspelt constant would disable the rule
-    that it is meant for.
+    """Raise ProfileError if the board's file has a constant that no rule names.
+
+    A misspelt constant would silently disable the rule that it is meant for.
     """
     keys: dict[str, set[str]] = {}
     for rule in all_rules():
@@ -189,20 +206,24 @@ def require_known(dpu: Dpu) -> None:
 
 
 def rule_name(rule: Callable[..., object]) -> str:
-    """Return the rule's name in tables, such as "conv kernel"."""
+    """Return the name of a rule in tables: that of its function, such as "conv kernel"."""
     return getattr(rule, "__name__", "").replace("_", " ")
 
 
 def applies(rule: Callable[..., object], dpu: Dpu) -> bool:
-    """Return True if the target defines every constant that the rule's text names. Otherwise the
-    rule is one of other DPUs.
+    """Return True if a rule holds on a device.
+
+    A rule's docstring names constants, such as {conv[kernel]}. It holds on the devices whose board
+    file defines all of them; otherwise it is a rule of other DPUs.
     """
     facts = _facts(dpu)
     return all(key in facts.get(table, {}) for table, key in _named(rule))
 
 
 def rule_text(rule: Callable[..., object], dpu: Dpu) -> str:
-    """Return the text of a rule or a remark, with the target's limits and documents filled in."""
+    """Return the text of a rule or a remark: its docstring, in which the limits and documents of
+    the device's board are filled in.
+    """
     return _template(rule).format(**_facts(dpu))
 
 

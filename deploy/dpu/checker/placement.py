@@ -61,8 +61,16 @@ FLOAT_NOTE = "a float file: judged as if its tensors had 8 bits, its final add l
 
 @dataclass(frozen=True)
 class PlacedNode:
-    """A node with its part and its device. If it should run on the DPU and cannot, also the rules
-    that it breaks.
+    """One operation of a network, and the device that runs it.
+
+    Attributes:
+        op: the operation.
+        part: the part of the network: the host's before the core, the core, or the host's after it.
+        device: "DPU"; "host" if it belongs to the host by design; "CPU" if it belongs to the core,
+            but breaks a rule of the DPU.
+        broken: the rules that an operation of the core breaks; empty if none.
+        subgraph: the number of the subgraph: connected operations that run on one device without a
+            transfer in between.
     """
 
     op: Operation
@@ -74,8 +82,12 @@ class PlacedNode:
 
 @dataclass(frozen=True)
 class Cut:
-    """A tensor that is transferred between the DPU and a processor, as int8. Its size is None if
-    its shape is unknown.
+    """A tensor that is transferred between the DPU and a processor.
+
+    Attributes:
+        tensor: the name of the tensor.
+        size_bytes: its size as int8 for one image; None if its shape is unknown.
+        onto_dpu: True if the DPU reads it, False if the DPU writes it.
     """
 
     tensor: str
@@ -85,7 +97,13 @@ class Cut:
 
 @dataclass(frozen=True)
 class Placement:
-    """The nodes in order. The note states what was assumed."""
+    """Where each operation of a network runs.
+
+    Attributes:
+        nodes: the operations in the order of the file, each with its device.
+        cuts: the tensors that are transferred between the DPU and a processor.
+        note: what was assumed of a float file; empty for a quantised one.
+    """
 
     nodes: tuple[PlacedNode, ...]
     cuts: tuple[Cut, ...]
@@ -93,7 +111,7 @@ class Placement:
 
     @property
     def dpu_subgraphs(self) -> int:
-        """The number of subgraphs that the DPU runs, each with its own transfers."""
+        """The number of parts of the network that the DPU runs without a transfer in between."""
         return len({node.subgraph for node in self.nodes if node.device == "DPU"})
 
     @property
@@ -103,8 +121,9 @@ class Placement:
 
     @property
     def cutting(self) -> tuple[PlacedNode, ...]:
-        """The failed nodes that cut the core in two. For a quantised file all failed nodes count,
-        because its integers can be regenerated.
+        """The nodes that the DPU cannot run although it must run nodes both before and after them.
+
+        For a quantised file they are all failed nodes, because its integers can be regenerated.
         """
         if not self.note:
             return self.failed
@@ -122,7 +141,15 @@ class Placement:
 
 
 def place(network: SizedGraph, dpu: Dpu) -> Placement:
-    """Check every node of a network against the rules of a DPU, and place it."""
+    """Check every operation of a network against the rules of a DPU, and decide where it runs.
+
+    Args:
+        network: the network, for one image size.
+        dpu: the device, with the limits of its rules.
+
+    Raises:
+        ProfileError: the board's file has a constant that no rule reads, probably misspelt.
+    """
     # A misspelt constant would silence the rule that it is for.
     require_known(dpu)
     parts = _parts(network)
@@ -169,8 +196,10 @@ def _parts(network: SizedGraph) -> list[Part]:
 def _left_to_the_host(
     network: SizedGraph, parts: list[Part], broken: list[tuple[Broken, ...]]
 ) -> list[Part]:
-    """Return the parts with more nodes left to the host. After the last convolution, a node that
-    reads a result of the CPU stays there, so that the tensor is not transferred again.
+    """Leave more nodes of a float network to the host, and return the part of each node.
+
+    After the last convolution, a node that reads a result of the CPU stays on the CPU, so that the
+    tensor is not transferred again.
     """
     before = _reached(network.operations, _convolved(network), forwards=False)
     cpu_results: set[str] = set()

@@ -122,7 +122,16 @@ NPU_REMARKS: tuple[Remark, ...] = (unread, depthwise, float_islands, unknown)
 
 
 def remarks_on(placement: Placement, dpu: Dpu, tile_px: int) -> dict[str, str]:
-    """Return every remark that applies to a placed network, by name."""
+    """Return what a reader of `check` should know of a network in addition to broken rules.
+
+    Args:
+        placement: where each node of the network runs.
+        dpu: the DPU configuration or NPU.
+        tile_px: side of the square image in pixels.
+
+    Returns:
+        The text of each remark that applies, by the name of its function.
+    """
     remarks = NPU_REMARKS if dpu.target.npu else REMARKS
     texts = {remark.__name__: remark(placement, dpu, tile_px) for remark in remarks}
     return {name: text for name, text in texts.items() if text}

@@ -32,14 +32,15 @@ OTHERS_NOTE = "quantised by operators that are not ONNX's: judged without their 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Checked(Table):
-    """The device of every node of a network: the host, the DPU or the CPU.
+    """The result of `check`: the device of every node of a network, and the rules that it breaks.
 
-    The table is true if the whole core runs on the DPU.
+    The table is true if the DPU (or NPU) can run the whole core, the part of the network that is
+    not left to the host by design, and if `quantize` would accept a float network.
 
     Attributes:
-        placement: the nodes, in order.
-        dpu: the configuration of the board.
-        tile_px: side of the tile.
+        placement: the nodes in order, each with its device.
+        dpu: the DPU configuration or NPU whose rules were checked.
+        tile_px: side of the square image in pixels that shapes were computed for.
         network: the network that was checked.
     """
 
@@ -55,7 +56,7 @@ class Checked(Table):
 
     @property
     def verdict(self) -> str:
-        """A sentence that states whether the network fits."""
+        """A sentence that states whether the device can run the network, and what that rests on."""
         if self.failed:
             return f"check FAILED: {'; '.join(map(str, self.failed))}"
         if self.dpu.target.npu:
@@ -77,14 +78,19 @@ def check_network(
     tile: int | None,
     output: str | None = None,
 ) -> Checked:
-    """Place every node of a network and return the rules that are broken.
+    """Check which nodes of a network a board's DPU or NPU can run; the work of `check`.
 
     Args:
-        network: float, INT8 or a board's core; the shipped INT8 one if None.
+        network: a network in float or INT8, or the integer core of one for a board; the shipped
+            convbeers-s-int8 if None.
         target: a board with a DPU or an NPU.
-        dpu: configuration of the DPU; the board's default if None.
-        tile: side of a tile in pixels; the network's own, else 640, if None.
-        output: the only output to check; all if None.
+        dpu: the name of the DPU's configuration; the board's default if None.
+        tile: side of the square image in pixels; if None, the size that the network is fixed to,
+            or 640.
+        output: the name of the only output to check; all outputs if None.
+
+    Returns:
+        The table of `check`.
 
     Raises:
         ModelError: the file is not an ONNX network of images.
@@ -163,9 +169,12 @@ def _rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:
 
 
 def legality(placement: Placement, *, npu: bool = False) -> Check:
-    """Return the check of the whole network, which fails if a node of its core breaks a rule.
+    """Summarise a placement as one check, which fails if a node of the core breaks a rule.
 
-    For an NPU, it is unknown which nodes the compiler refuses.
+    Args:
+        placement: where each node runs.
+        npu: True for an NPU. The name of the check then does not say that nodes are refused,
+            because AMD publishes no limits of its compiler.
     """
     name = "nodes that break a rule" if npu else "nodes the DPU refuses"
     failed = placement.failed

@@ -37,7 +37,7 @@ BANDS = 4
 
 
 def host_work(bytes_in: float, bytes_out: float, values: float, task: Task) -> Array:
-    """Return the amounts of work of the host for one image, (7,).
+    """Count the work of a board's processor, the host, for one image.
 
     Args:
         bytes_in: bytes of the DPU's inputs.
@@ -47,8 +47,8 @@ def host_work(bytes_in: float, bytes_out: float, values: float, task: Task) -> A
         task: what the host does with the results.
 
     Returns:
-        1 for the image, bytes copied in, bytes copied out, then the values of each task except
-        "copy": 0 for all but `task`.
+        An array (7,): 1 for the image, bytes copied to the DPU, bytes copied from it, then the
+        values read by argmax, softmax, sort and image, of which only the one of `task` is not 0.
     """
     copied_bytes = 0.0 if task == "image" else bytes_out
     return np.array([1.0, bytes_in, copied_bytes, *(values * (task == name) for name in TASKS[1:])])
@@ -59,26 +59,31 @@ COPIES = 3
 
 
 def host_parts_s(units: Array, constants: Constants) -> Array:
-    """Return the time of the host's copies and of its task on one core, (n, 2).
+    """Predict the time of the host for an image, on one core.
 
     Args:
-        units: amounts of work as `host_work` returns them, (n, 7).
+        units: the work of n networks, (n, 7), each row as `host_work` returns it.
         constants: the constants of the board.
+
+    Returns:
+        Times in s, (n, 2): of copying the image and the results, and of the task.
     """
     times = units * constants.host_s_per_unit
     return np.stack([times[:, :COPIES].sum(axis=1), times[:, COPIES:].sum(axis=1)], axis=1)
 
 
 def placed_work(placement: Placement, task: Task) -> Array:
-    """Return the amounts of work of the host for a placed network, (7,), in the order of
-    `host_work`.
+    """Count the work of the host for one image, from the tensors that cross to and from the DPU.
 
     The task reads every value of the results. A task "sort" on the maps of YOLO reads only one
     score for each box.
 
     Args:
-        placement: the operations of the network on DPU and host.
+        placement: where each operation of the network runs.
         task: what the host does with the results.
+
+    Returns:
+        An array (7,) as `host_work` returns it.
     """
     onto, back = _crossing_bytes(placement)
     return host_work(onto, back, back * (_scores(placement) if task == "sort" else 1), task)
@@ -94,8 +99,8 @@ place and size, a score, and a class.
 def _scores(placement: Placement) -> float:
     """Return the share of the results that a sort reads.
 
-    The host skips a box whose score is low. A file with maps of one number of channels, a multiple
-    of BOXES, is taken as YOLO's; of others, which have classes apart from places, all is read.
+    The host skips a box whose score is low. A network is taken for YOLO if all its results have the
+    same number of channels, a multiple of BOXES. All results of other networks are read.
     """
     back = {cut.tensor for cut in placement.cuts if not cut.onto_dpu}
     channels = {
@@ -109,10 +114,11 @@ def _scores(placement: Placement) -> float:
 
 
 def task_of(placement: Placement) -> Task:
-    """Return the task of the host, derived from the operators behind the DPU.
+    """Derive what the host does with the DPU's results from the operators after the DPU.
 
-    Without such an operator, a single result with few bands that is not smaller than the input is
-    taken for an image.
+    Without an operator of OPERATORS, a single result of at most BANDS channels is taken for an
+    image if the DPU returns at least as many bytes as it receives. Any other result is only
+    copied.
     """
     for node in placement.nodes:
         if node.part == "host-back" and node.op.op_type in OPERATORS:
@@ -150,17 +156,18 @@ two (assumed).
 
 
 def refused_interval_s(operations: Sequence[Operation], dpu: Dpu) -> Interval:
-    """Return the shortest and the longest time in s that the host needs for the operations that the
-    DPU refuses.
+    """Estimate the time that the host needs for the operations that the DPU refuses.
 
-    It is the time of all cores for one image. It is not fitted, because published rates do not
-    separate such work. The shortest time follows from the processor's published rates: products as
-    in an optimised library, and each number moved once. The longest time is that of plain code,
-    number by number.
+    The estimate is not fitted, because published rates do not separate such work. The shortest time
+    follows from the processor's published rates: products as in an optimised library, and each
+    number moved once. The longest time is that of plain code, number by number.
 
     Args:
-        operations: those that the DPU refuses.
+        operations: the operations that the DPU refuses.
         dpu: the configuration, whose board states the processor.
+
+    Returns:
+        The shortest and the longest time in s, for one image on all cores together.
     """
     if not operations:
         return 0.0, 0.0
@@ -190,14 +197,18 @@ def _plain_work_s(operations: float, moved_values: float, results: float, dpu: D
 
 
 def consistency_interval_s(pixels: float, dpu: Dpu) -> Interval:
-    """Return the shortest and the longest time in s that the host needs for the consistency step.
+    """Estimate the time that the host needs for the consistency step, after the network.
 
-    It is the time of all cores and is not fitted. The raw and the restored image are read and the
-    result is written; all other numbers stay in the caches.
+    The step makes block means of the result agree with the raw image. The estimate is not fitted:
+    the raw and the restored image are read, the result is written, and all other numbers stay in
+    the caches.
 
     Args:
         pixels: number of pixels that the step is computed for.
         dpu: the configuration, whose board states the processor.
+
+    Returns:
+        The shortest and the longest time in s, on all cores together.
     """
     # A product with its sum counts as two operations.
     low_s, high_s = _plain_work_s(2 * PRODUCTS_PER_PX * pixels, 3 * pixels, pixels, dpu)

@@ -23,12 +23,18 @@ of the network in one size on one configuration. What is left is the scatter of 
 
 
 def levels_of(operations: Sequence[Operation], dpu: Dpu, bound: str) -> Levels:
-    """Return the keys of the levels at which a run is related to others, one for each of SHARES.
+    """Compute keys that are equal for two runs that have something in common.
+
+    The keys stand for: the board and what limits the rate; the kinds of layers; the network; and
+    the network at one size on one configuration.
 
     Args:
         operations: the operations of the network, in order.
-        dpu: the configuration that it runs on.
-        bound: what sets its rate by the prediction, the host or the DPU.
+        dpu: the configuration that the network runs on.
+        bound: what limits the predicted rate, "host" or "DPU".
+
+    Returns:
+        Four hashes, one for each of SHARES.
     """
     computing = [op for op in operations if op.kind not in FUSED]
     # The window of a pool over a whole map is as large as the map, whatever the network.
@@ -42,12 +48,17 @@ def levels_of(operations: Sequence[Operation], dpu: Dpu, bound: str) -> Levels:
 
 
 def correction(of: Levels, runs: Sequence[tuple[Levels, float]]) -> tuple[float, float]:
-    """Return the factor by which a network is faster than predicted, and the share of its
-    interval's width that remains.
+    """Correct the prediction of a network by runs that were measured on the user's board.
+
+    The more keys a run has in common with the network, the more it counts (kriging).
 
     Args:
-        of: the network.
-        runs: the runs of the owner, each with its ln(given / predicted).
+        of: the keys of the network, as `levels_of` returns them.
+        runs: the keys of each measured run, and its ln(measured / predicted rate).
+
+    Returns:
+        The factor by which the predicted rate is multiplied, and the factor in (0, 1] by which the
+        width of its interval is multiplied; (1, 1) without runs.
     """
     if not runs:
         return 1.0, 1.0

@@ -49,7 +49,15 @@ Bound = Literal["host", "DPU"]
 
 @dataclass(frozen=True)
 class LayerCost:
-    """The predicted times of one operation for a batch, and its work for one image."""
+    """The predicted time of one operation on the DPU, for a batch.
+
+    Attributes:
+        work: the work of the operation for one image.
+        compute_s: the time that the DPU's engines compute, in s.
+        memory_s: the time of the transfers to and from memory, in s.
+        time_s: the time of the operation in s. It is shorter than the sum of both, as far as they
+            overlap, and includes the start of the operation.
+    """
 
     work: Work
     compute_s: float
@@ -58,7 +66,7 @@ class LayerCost:
 
     @property
     def bound(self) -> str:
-        """Return which part of the time is longest: compute, memory or, if neither is, overhead."""
+        """Return the longest part of the time: "compute", "memory", or "overhead" for the rest."""
         overhead_s = self.time_s - self.compute_s - self.memory_s
         parts = {"compute": self.compute_s, "memory": self.memory_s, "overhead": overhead_s}
         return max(parts, key=lambda name: parts[name])
@@ -66,23 +74,29 @@ class LayerCost:
 
 @dataclass(frozen=True)
 class Prediction:
-    """The prediction of the cost model for one network on one configuration.
+    """The prediction of the cost model for one network on one DPU configuration.
+
+    A batch is the images that the DPU computes at once. The host is the processor of the board,
+    which prepares images and reads results while the DPU computes.
 
     Attributes:
         dpu: the configuration.
-        alone_s: time of one core's batch on the DPU while its other cores rest.
-        layers: the cost of each layer, for a batch.
-        host_s: time of an image on all cores of the host together.
+        alone_s: time in s of one core's batch on the DPU while the other cores rest.
+        layers: the cost of each operation on the DPU, for a batch.
+        host_s: time in s of an image on all cores of the host together.
         task: what the host does with the results.
-        width: half the width of the interval, in ln(FPS).
+        width: half the width of the interval of the rate, in ln(frames per second).
         bound: what limits the rate, the DPU or the host.
-        levels: the properties that it shares with runs of the user's board.
-        speed: the factor by which these runs show the board to be faster than the constants.
-        outside: properties outside the range of the fitted networks; empty if there are none.
-        note: what was assumed of the file.
-        refused: names of the nodes that the DPU refuses and the host runs.
-        refused_s: shortest and longest time of these nodes, a part of `host_s`.
-        step_s: shortest and longest time of the consistency step, a part of `host_s`.
+        levels: keys of what the network has in common with runs of the user's board (`kinship`).
+        speed: the factor by which these runs show the board to be faster than the fitted constants
+            say; 1 without runs. All times here are divided by it.
+        outside: a sentence for each property beyond the networks that the constants were fitted to;
+            empty if there are none.
+        note: what was assumed of a float file; empty for a quantised one.
+        refused: the names of the nodes that the DPU refuses and the host runs.
+        refused_s: shortest and longest time in s of these nodes for an image, a part of `host_s`.
+        step_s: shortest and longest time in s of the consistency step for an image, a part of
+            `host_s`. The step makes block means of the result agree with the raw image.
     """
 
     dpu: Dpu
@@ -107,13 +121,14 @@ class Prediction:
 
     @cached_property
     def batch_time_s(self) -> float:
-        """Return the time of the layers of one batch on the DPU, without the host."""
+        """Return the time in s of one batch on the DPU, without the host, if all cores work."""
         return math.fsum(layer.time_s for layer in self.layers)
 
     @property
     def fps(self) -> float:
-        """Return the images per second, if batches follow each other and the host works in
-        parallel.
+        """Return the predicted rate in frames per second.
+
+        Batches follow each other without a pause, and the host works in parallel to the DPU.
         """
         return self._rate(self.host_s)
 
@@ -121,7 +136,8 @@ class Prediction:
     def fps_interval(self) -> Interval:
         """Return the lowest and the highest rate in frames per second.
 
-        The first assumes the slowest host, the second the fastest; both are widened by `spread`.
+        The lowest assumes the longest time of the host, the highest the shortest. The lowest is
+        then divided by `spread`, and the highest multiplied by it.
         """
         # The host at its fastest comes first.
         fast, slow = map(self._rate, self._host_ends_s)
@@ -129,7 +145,7 @@ class Prediction:
 
     @property
     def host_interval_s(self) -> Interval:
-        """Return the lowest and the highest value of `host_s`."""
+        """Return the interval of `host_s` in s, for one image."""
         return self._widened(*self._host_ends_s)
 
     @property
@@ -143,7 +159,7 @@ class Prediction:
 
     @property
     def latency_interval_s(self) -> Interval:
-        """Return the lowest and the highest value of `latency_s`."""
+        """Return the interval of `latency_s` in s."""
         return self._widened(*map(self._latency_s, self._host_ends_s))
 
     def _widened(self, low: float, high: float) -> Interval:
@@ -155,7 +171,7 @@ class Prediction:
 
     @property
     def spread(self) -> float:
-        """Return the factor by which each time may be wrong in either direction."""
+        """Return e^width, the factor by which the rate and each time may be wrong either way."""
         return math.exp(self.width)
 
     @property
@@ -175,7 +191,7 @@ class Prediction:
 
     @property
     def operations(self) -> int:
-        """Return the int8 operations for one image."""
+        """Return the number of int8 operations of all layers on the DPU, for one image."""
         return sum(layer.work.operations for layer in self.layers)
 
     @property
@@ -187,16 +203,17 @@ class Prediction:
 def predict(
     placement: Placement, dpu: Dpu, task: Task | None = None, step_px: float = 0.0
 ) -> Prediction:
-    """Predict the rate and latency of a network on a DPU, from formula and constants.
+    """Predict the rate and latency of a network on a DPU by the cost model (see `model`).
 
-    The DPU must run all convolutions. Nodes that it refuses before the first or after the last of
-    them run on the host.
+    The DPU must run all convolutions. Nodes that it refuses before the first convolution or after
+    the last one run on the host.
 
     Args:
         placement: where each node of the network runs.
-        dpu: the configuration of a board.
-        task: what the host does with the results; None derives it from the file.
-        step_px: pixels of an image for which the host computes the consistency step; 0 for no step.
+        dpu: the configuration of a board, with the runs of the user's own board if there are any.
+        task: what the host does with the results; None derives it from the network's operators.
+        step_px: number of pixels of an image for which the host computes the consistency step,
+            which makes block means of the result agree with the raw image; 0 for no step.
 
     Raises:
         ModelError: the DPU refuses a node inside the core, or the network has no convolution.
@@ -261,7 +278,7 @@ def predict(
 
 
 WIDTHS = {part: f"width_{part}" for part in (*PARTS, "outside")}
-"""Where [cost] keeps half the width of an interval, in ln(FPS)."""
+"""The key in [cost] of half the width of an interval, in ln(FPS), by the part of the time."""
 ROUNDED = 1e-3
 """How far [cost] rounds the ends of the fitted range: the largest fitted
 network is not beyond it.
@@ -288,11 +305,18 @@ def _outside(core: Sequence[Operation], dpu: Dpu) -> tuple[str, ...]:
 
 
 def dpu_power(dpu: Dpu) -> Figure:
-    """Return the power in W while the DPU runs: the published range of the board.
+    """Return the power of a board in W while its DPU runs, for the energy per image.
 
-    It does not depend on the network. The published points do not allow an energy per operation or
-    per byte: above idle, the VCK190 needs 0.8 pJ for an operation of YOLOv8s, and 2.3 pJ for one of
-    ConvBEERS.
+    The power does not depend on the network. The published points do not allow an energy per
+    operation or per byte: above idle, the VCK190 needs 0.8 pJ for an operation of YOLOv8s, and 2.3
+    pJ for one of ConvBEERS.
+
+    Args:
+        dpu: a configuration of the board.
+
+    Returns:
+        The geometric mean of the published range, with the range as its interval; unavailable if
+        none is published.
     """
     if "dpu_range_w" not in dpu.tables.get("power", {}):
         return unavailable("W", f"no power of {dpu.target.name} under its DPU is published")

@@ -26,43 +26,54 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True)
 class Constants:
-    """The constants that are fitted to published rates.
+    """The constants of the cost model that are fitted to published frame rates.
 
     Constants of the hardware are not fitted, so that a board can be predicted with the constants of
     another board of the same kind.
 
-    The first four describe the DPU. Rates of the host are rates of one of its cores; a value is one
-    number of a result.
+    The first four describe the DPU, the others the board's processor, which prepares the image and
+    reads the results. Times and rates of the processor are those of one of its cores. A value is
+    one number of a result.
     """
 
     array_efficiency: float
     """Share of the array's peak that a full layer reaches, at most 1."""
     port_bytes_per_cycle: float
-    """What one batch handler moves in a cycle of the programmable logic."""
+    """Bytes that one batch handler transfers in a cycle of the programmable logic."""
     memory_efficiency: float
-    """Share of the memory's peak that all cores together reach."""
+    """Share of the memory's peak that all cores together reach, at most 1."""
     layer_s: float
-    """Start of a layer."""
+    """Time that the start of a layer takes, in s."""
     host_image_s: float
-    """What the host does for any image."""
+    """Time that the processor spends on any image, in s."""
     host_in_bytes_per_s: float
-    """Scaling the image and handing it over."""
+    """Rate at which the image is scaled and sent to the DPU."""
     host_out_bytes_per_s: float
-    """Taking the results back."""
+    """Rate at which the results are copied from the DPU."""
     argmax_values_per_s: float
+    """Rate at which the best of several classes is searched."""
     softmax_values_per_s: float
+    """Rate at which scores of classes are converted to probabilities."""
     sort_values_per_s: float
+    """Rate at which boxes or key points are ranked."""
     image_values_per_s: float
+    """Rate at which results are converted to pixels."""
 
     @classmethod
     def of(cls, dpu: Dpu) -> Self:
-        """Read the constants that a target profile states in [cost]."""
+        """Read the constants that a board's profile states in its table [cost].
+
+        Raises:
+            ProfileError: the profile lacks one, because the board has no cost model.
+        """
         return cls(*(dpu.value("cost", name) for name in NAMES))
 
     @property
     def host_s_per_unit(self) -> Array:
-        """Return the time of an image, of a byte in, of a byte out and of a value of each task,
-        (7,).
+        """Return the time in s that each unit of `host.host_work` takes on one core, shape (7,).
+
+        The units are an image, a byte to the DPU, a byte from it, and a value of each of four
+        tasks.
         """
         host_names = NAMES[NAMES.index("host_image_s") :]
         image_s, *rates = (getattr(self, name) for name in host_names)
@@ -74,39 +85,58 @@ NAMES = tuple(field.name for field in fields(Constants))
 
 @dataclass(frozen=True)
 class Structure:
-    """The parameters of the formula that depend on the kind of the board and are not fitted."""
+    """The parameters of this module's formula that depend on the kind of board.
+
+    In contrast to `Constants`, they are not fitted.
+    """
 
     overlap: float
     """Share of the shorter of compute and memory that is hidden behind the longer."""
     contention_exponent: float
-    """Exponent q of (dpu^q + host^q)^(1/q): 2 where the two get in each other's way, large where
-    they do not.
+    """Exponent q of the time (dpu^q + host^q)^(1/q) of an image: about 2 on boards where DPU and
+    processor slow each other down, large on others.
     """
 
     @classmethod
     def of(cls, dpu: Dpu) -> Self:
-        """Read the constants of a target profile."""
+        """Read the parameters that a board's profile states in [cost]."""
         return cls(*(dpu.value("cost", field.name) for field in fields(cls)))
 
 
 @dataclass(frozen=True)
 class Layers:
-    """Layers as arrays (n,), each with the DPU that runs it; maps are those of one image."""
+    """The n layers of one or several networks as arrays (n,), with the hardware that runs each.
 
-    array_s: Array  # at the array's peak
-    lane_s: Array  # with every lane busy
+    A map is a tensor between two layers.
+
+    Attributes:
+        array_s: time of the convolution array for one image at its peak, in s.
+        lane_s: time of the element-wise engine for one image at its peak, in s.
+        weight_bytes: bytes of the weights.
+        map_bytes: bytes of maps that are loaded and stored for one image.
+        launched: 1 for a layer with a start of its own, 0 for one that runs with the layer before.
+        pl_clock_hz: clock of the programmable logic.
+        memory_bytes_per_s: peak rate of the board's memory.
+        handlers: number of batch handlers (images at once) of a core.
+        cores: number of cores of the DPU.
+        serial: 1 if the layer loads its maps only after the layer before, so that nothing hides the
+            transfer; 0 otherwise.
+    """
+
+    array_s: Array
+    lane_s: Array
     weight_bytes: Array
     map_bytes: Array
-    launched: Array  # 1, or 0 for what is fused or only moves no data
+    launched: Array
     pl_clock_hz: Array
     memory_bytes_per_s: Array
-    handlers: Array  # batch handlers of a core
+    handlers: Array
     cores: Array
-    serial: Array  # 1, or 0 where the transfers queue up
+    serial: Array
 
     @classmethod
     def of(cls, works: Sequence[Work], dpu: Dpu) -> Self:
-        """Collect the layers of one network."""
+        """Collect the layers of one network, all of which run on `dpu`."""
         array = dpu.engine_ops_per_s
         lanes = dpu.lane_steps_per_s
         clock_hz = dpu.value("array", "pl_clock_hz")
@@ -128,14 +158,19 @@ class Layers:
         return cls(*np.array(rows, dtype=np.float64).reshape(-1, 10).T)
 
     def compute_s(self, constants: Constants) -> Array:
-        """Return the time of the array and of the engines next to it, (n,). All batch handlers work
-        at once.
+        """Return the time in s that each layer computes for a batch, shape (n,).
+
+        The batch handlers compute their images at once, so it is the time of one image.
         """
         return self.array_s / constants.array_efficiency + self.lane_s
 
     def memory_s(self, constants: Constants, *, alone: bool = False) -> Array:
-        """Return the time of the transfers for a batch of every core or, if `alone`, of one core,
-        (n,).
+        """Return the time in s of each layer's transfers to and from memory, shape (n,).
+
+        Args:
+            constants: the fitted constants.
+            alone: False if every core computes a batch, so that they share the memory; True if only
+                one core does.
         """
         port = constants.port_bytes_per_cycle * self.pl_clock_hz
         shared = constants.memory_efficiency * self.memory_bytes_per_s
@@ -147,12 +182,24 @@ class Layers:
         return np.maximum(port_s, (1.0 if alone else self.cores) * shared_s)
 
     def time_s(self, constants: Constants, structure: Structure, *, alone: bool = False) -> Array:
-        """Return the time of each layer for a batch, (n,)."""
+        """Return the time in s of each layer for a batch, shape (n,).
+
+        Args:
+            constants: the fitted constants.
+            structure: the parameters that depend on the kind of the board.
+            alone: True if only one core computes a batch, and the others rest.
+        """
         times: Array = self.parts_s(constants, structure, alone=alone).sum(axis=1)
         return times
 
     def parts_s(self, constants: Constants, structure: Structure, *, alone: bool = False) -> Array:
-        """Return the time of each layer for a batch by the first four of PARTS, (n, 4)."""
+        """Split the time in s of each layer for a batch into the first four of PARTS, shape (n, 4).
+
+        Args:
+            constants: the fitted constants.
+            structure: the parameters that depend on the kind of the board.
+            alone: True if only one core computes a batch, and the others rest.
+        """
         compute = self.compute_s(constants)
         memory = self.memory_s(constants, alone=alone)
         # What the longer of the two hides of the shorter counts for neither.
@@ -171,8 +218,9 @@ ZCU104, where AMD's profile of its layers has 3.2 to 3.7.
 """
 
 PARTS = ("array", "lanes", "memory", "start", "copies", "task")
-"""What the time of an image consists of: the array, the engines beside it, transfers and starts on
-the DPU, then the host's copies and its task. The prediction of each is off by a width of its own.
+"""The parts of the time of an image: on the DPU the convolution array, the element-wise engine,
+transfers and starts of layers; on the host the copies and its task. Each part has an uncertainty of
+its own.
 """
 
 
@@ -184,8 +232,8 @@ def shares_of(dpu_s: Array, host_s: Array, contention_exponent: float) -> Array:
     1.
 
     Args:
-        dpu_s: time of an image by the first four parts, (n, 4).
-        host_s: time by the last two, on all cores, (n, 2).
+        dpu_s: time of an image on the DPU in each of the first four parts, (n, 4) for n networks.
+        host_s: time of an image on all cores of the host in each of the last two, (n, 2).
         contention_exponent: exponent of `frame_rate`.
     """
     dpu, host = (times.sum(axis=1, keepdims=True) for times in (dpu_s, host_s))
@@ -199,12 +247,14 @@ def shares_of(dpu_s: Array, host_s: Array, contention_exponent: float) -> Array:
 
 
 def frame_rate(dpu_s: float, host_s: float, contention_exponent: float) -> float:
-    """Return the images per second.
+    """Compute the images per second of a DPU and a host that work in parallel.
+
+    It is 1 / (dpu^q + host^q)^(1 / q).
 
     Args:
-        dpu_s: time of the DPU for one image.
-        host_s: time of the host's cores for one image.
-        contention_exponent: q of the formula above.
+        dpu_s: time of the DPU for one image, in s.
+        host_s: time of all cores of the host for one image, in s.
+        contention_exponent: q; the larger, the less the two slow each other down.
     """
     longer = max(dpu_s, host_s)
     shorter = min(dpu_s, host_s)
@@ -215,5 +265,5 @@ def frame_rate(dpu_s: float, host_s: float, contention_exponent: float) -> float
 
 
 def between(interval: Interval) -> float:
-    """Return the geometric mean of the ends of an interval."""
+    """Return the geometric mean of the two ends of an interval."""
     return math.sqrt(interval[0] * interval[1])

@@ -32,16 +32,16 @@ FAR = 10_000
 
 @pydantic_dataclass(frozen=True, config=CONFIG)
 class Entry:
-    """One run as a file states it, such as `measure.py` writes it.
+    """One measurement in a JSON file of a user's own board, such as `measure.py` of a kit writes.
 
     Attributes:
-        model: the path of the network, relative to the file.
-        fps: frames per second.
-        tile_px: side of a tile in pixels.
-        configuration: the configuration of the DPU; the board's default if None.
-        target: the board, if it is another one with the same DPU.
-        provider: the provider of onnxruntime.
-        power_w: not used, because runs correct rates alone.
+        model: the path of the network, relative to the JSON file.
+        fps: the measured rate in frames per second; a frame is one tile.
+        tile_px: side of a tile in pixels; by default that of the shipped networks' kits.
+        configuration: the name of the DPU's configuration; the board's default if None.
+        target: the name of the board, if it is another one with the same DPU.
+        provider: the execution provider of onnxruntime that ran the network.
+        power_w: the measured power in W. It is not used, because runs correct only rates.
     """
 
     model: str
@@ -58,8 +58,13 @@ ENTRIES = TypeAdapter(Annotated[list[Entry], Field(min_length=1, max_length=100)
 
 @dataclass(frozen=True)
 class Run:
-    """One entry of the file: a network placed on a configuration, the rate given for it and the one
-    predicted.
+    """One measurement on a user's own board, together with its prediction.
+
+    Attributes:
+        name: the name of the network and its tile size, for tables.
+        placement: where each operation of the network runs.
+        fps: the measured rate in frames per second.
+        predicted: the prediction without any correction by measurements.
     """
 
     name: str
@@ -69,7 +74,9 @@ class Run:
 
     @property
     def ratio(self) -> tuple[Levels, float]:
-        """Return the levels of kinship of the run, and ln(given / predicted)."""
+        """Return the keys of what the run has in common with others (`kinship.levels_of`), and
+        ln(measured / predicted rate).
+        """
         return self.predicted.levels, math.log(self.fps / self.predicted.fps)
 
 
@@ -78,19 +85,24 @@ class OwnRuns:
     """Rates that a user measured on their own board, which correct predictions.
 
     Attributes:
-        source: what figures state as their source: the number of runs and the file's name.
-        runs: each with the prediction of the same network and configuration.
+        source: the number of runs and the name of their file, which figures state as their source.
+        runs: the measurements, each with the prediction of the same network and configuration.
     """
 
     source: str
     runs: Sequence[Run]
 
     def applied(self, dpu: Dpu) -> Dpu:
-        """Return the configuration with the runs, which correct its predictions."""
+        """Return a copy of a configuration whose predictions these runs correct."""
         return replace(dpu, runs=tuple(run.ratio for run in self.runs))
 
     def run_rows(self) -> list[Row]:
-        """Return a row for each run: its rate, and the predictions without and by other runs."""
+        """Compare each measured rate with its prediction, to show what the runs improve.
+
+        Returns:
+            A row for each run with the measured rate, the prediction without any run, the
+            prediction corrected by all other runs, and the error of both in percent.
+        """
         rows = []
         for run in self.runs:
             before = run.predicted
@@ -109,10 +121,18 @@ class OwnRuns:
 
 
 def read_own_runs(path: Path, dpu: Dpu) -> OwnRuns:
-    """Compare the runs in a file with their predictions on the board of `dpu`.
+    """Read the measurements of a user's own board, and predict each of them.
+
+    Args:
+        path: the JSON file, a list of `Entry`.
+        dpu: a configuration of the board that is to be predicted. Measurements may be of its other
+            configurations, and of other boards with the same DPU.
 
     Raises:
-        OptionError: the file is not a list of runs, or a run is not one of this board.
+        OptionError: the file is not a list of measurements; or one is of another DPU, of
+            onnxruntime's CPU provider, or too far from its prediction to be of the same network.
+        ModelError: a network cannot be read, or does not run on the DPU.
+        ProfileError: there is no such board or configuration.
     """
     try:
         entries = ENTRIES.validate_python(read_json(path))

@@ -33,39 +33,68 @@ passes through memory.
 
 @dataclass(frozen=True)
 class Work:
-    """One operation: what it counts for one image; its weights are loaded once a batch and core."""
+    """The work of one operation for one image, counted from shapes.
+
+    A map is a tensor between two operations.
+
+    Attributes:
+        name: the name of the ONNX node.
+        kind: the kind of operation.
+        operations: the int8 operations that the result needs.
+        array_operations: the operations of the convolution array, including those of channels and
+            pixels that only fill it up; 0 for work of another engine.
+        lane_steps: the values that the element-wise engine reads, including those that only fill it
+            up; 0 for work of the array.
+        weight_bytes: the bytes of the weights, which each core loads once for a batch.
+        load_map_bytes: the bytes of maps that are loaded from memory.
+        store_map_bytes: the bytes of maps that are stored to memory.
+        serial: True if the operation loads its maps only after the operation before, so that
+            nothing hides the transfer.
+    """
 
     name: str
     kind: str
     operations: int
-    array_operations: int  # computed by the array, used or not
-    # Values that the ALU or the element-wise engine takes in, unused lanes included.
+    array_operations: int
     lane_steps: int
     weight_bytes: int
     load_map_bytes: int
     store_map_bytes: int
-    serial: bool  # it loads behind the operation before, and nothing hides it
+    serial: bool
 
     @property
     def array_use(self) -> float:
-        """Return the share of the array's operations that are needed, 0 to 1; 1 for work outside
-        the array.
+        """Return the share of the array's operations that the result needs, in [0, 1].
+
+        The others are those of channels and pixels that only fill the array up. The share is 1 for
+        work of another engine.
         """
         return self.operations / self.array_operations if self.array_operations else 1.0
 
     @property
     def map_bytes(self) -> int:
-        """Return the bytes of feature maps that are loaded and stored."""
+        """Return the bytes of maps that pass through memory for one image."""
         return self.load_map_bytes + self.store_map_bytes
 
     @property
     def launched(self) -> bool:
-        """Return True if the operation has a start of its own."""
+        """Return True if the operation is started by itself, which takes `Constants.layer_s`.
+
+        Adds, multiplications and concats run with the operation before them.
+        """
         return self.kind not in UNSTARTED
 
 
 def count_work(operations: Sequence[Operation], dpu: Dpu) -> tuple[Work, ...]:
-    """Count the work of operations that run in sequence on the DPU."""
+    """Count the work of operations that run in sequence on the DPU.
+
+    Args:
+        operations: the operations, in the order in which they are computed.
+        dpu: the configuration, whose sizes decide what fills the array up and what fits the chip.
+
+    Returns:
+        One entry for each operation, except those of the kinds FUSED, which cost nothing.
+    """
     flow = _Flow(operations, dpu)
     works = []
     for op in operations:
@@ -147,14 +176,14 @@ def _up(count: int, size: int) -> int:
 
 
 class _Flow:
-    """Which results pass through memory: what banks cannot hold, or not for long, and what a concat
-    joins.
+    """The maps of a network that pass through memory, because the banks on the chip cannot hold
+    them, too many operations read them, or a concat joins them.
 
-    An add or mul is fused with the operation before it, which stores the result. Of maps that do
-    not fit the chip the other operand is loaded, and nothing hides that.
+    An add or mul is fused with the operation before it, which stores the result. If the maps do not
+    fit on the chip, the other operand is loaded from memory, and nothing hides that transfer.
 
-    What a concat joins, and what a pixel shuffle moves, is stored pixel by pixel between what
-    others store: a pixel's channels take whole bursts.
+    The operands of a concat, and the map that a pixel shuffle moves, are stored interleaved with
+    those of other operations, so that the channels of each pixel take whole bursts.
     """
 
     def __init__(self, operations: Sequence[Operation], dpu: Dpu) -> None:
@@ -184,7 +213,7 @@ class _Flow:
         self._sums = {self._root(self._fused(op)): op.output for op in sums}
 
     def serial(self, op: Operation) -> bool:
-        """Return True if an operation adds or multiplies two maps that do not fit the chip."""
+        """Return True if an operation adds or multiplies two maps that do not fit on the chip."""
         return (
             op.kind in ("add", "mul")
             and len(op.inputs) == 2
@@ -193,8 +222,10 @@ class _Flow:
         )
 
     def load(self, op: Operation) -> int:
-        """Return the bytes that are read. The operand that an add is fused with, and what that
-        operation has read, are on the chip.
+        """Return the bytes that an operation reads from memory.
+
+        An add is fused with the operation that writes one of its operands. That operand and the
+        inputs of that operation are on the chip, so they are not read again.
         """
         # A concat computes nothing: its operands were stored where it joins them.
         if op.kind == "concat":
@@ -214,8 +245,9 @@ class _Flow:
         )
 
     def store(self, op: Operation) -> int:
-        """Return the bytes that are written. A fused add writes in place of the operation that it
-        is fused with.
+        """Return the bytes that an operation writes to memory.
+
+        A fused add counts 0, because the operation that it is fused with counts them.
         """
         if op.kind in UNSTARTED:
             return 0
@@ -268,5 +300,5 @@ def _size(shape: Shape | None) -> int:
 
 
 def largest_map_bytes(operations: Sequence[Operation]) -> int:
-    """Return the size of the largest result of a network."""
+    """Return the size as int8 in bytes, for one image, of the largest result in a network."""
     return max(op.out_bytes for op in operations if op.kind not in FUSED)
