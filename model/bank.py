@@ -81,10 +81,10 @@ or at the edge of a saturated area.
 
 @dataclass(frozen=True)
 class Bank:
-    """The filters of one sensor.
+    """The four filters in front of a network, computed from the MTF and the noise of one sensor.
 
     Attributes:
-        details: D_k, (4, 7, 7) float64.
+        details: the kernels D_k of the filters, (4, 7, 7) float64.
         sigma: standard deviation of the noise at a quarter of full scale, as a share of full scale.
     """
 
@@ -120,7 +120,7 @@ class Bank:
 
     @property
     def planes(self) -> NDArray[np.float64]:
-        """The kernels of u_k, (4, 7, 7)."""
+        """The kernels (4, 7, 7) that compute the planes u_k from shares of full scale."""
         return self.details / self.units[:, None, None]
 
     @property
@@ -132,7 +132,7 @@ class Bank:
 
     @cached_property
     def filters(self) -> NDArray[np.float64]:
-        """The kernels of the four planes and of (W_1 - 1) x / g, shape (5, 7, 7)."""
+        """The kernels (5, 7, 7) of the planes u_k and of the analytic part (W_1 - 1) x / g."""
         return np.concatenate([self.planes, self.analytic[None] / self.unit])
 
     @property
@@ -214,9 +214,9 @@ def fitted_kernel(
     different amount for each MTF curve.
 
     Args:
-        gain: W_k at the frequencies of a grid, (GRID, GRID).
-        power: |H|^2 + eps_k r^2 there.
-        r_squared: r^2 there.
+        gain: the frequency response W_k at the frequencies of a grid, (GRID, GRID).
+        power: |H|^2 + eps_k r^2 at these frequencies, (GRID, GRID).
+        r_squared: the squared frequency r^2 at them, (GRID, GRID).
     """
     weights = np.zeros_like(power)
     # At frequency 0 the weight is infinite. The equation for the sum stands for it below.

@@ -43,7 +43,7 @@ from beers_deploy.profiles.instrument import Instrument
 
 
 class ResidualBlock(nn.Module):
-    """x + conv(relu(conv(x))), (N, F, H, W) to the same shape."""
+    """A residual block, x + conv(relu(conv(x))), of maps (N, F, H, W) of any size."""
 
     def __init__(self, features: int) -> None:
         super().__init__()
@@ -137,25 +137,28 @@ class Rounding:
     """How an INT8 file rounds the maps of a network behind a bank.
 
     Attributes:
-        stream: step size of the maps between head and tail, (F, 1, 1), at a gain of 1.
-        inner: step size of the map within each block.
+        stream: the quantisation step of the F maps between head and tail, (F, 1, 1), for a bank
+            whose `gain` is 1.
+        inner: the quantisation step of the map within each block, for the same bank.
     """
 
     stream: Tensor
     inner: tuple[Tensor, ...]
 
     def steps(self, gains: Tensor) -> list[Tensor]:
-        """Compute the step sizes for images whose banks have the gains (N,).
+        """Compute the quantisation steps for N images, each with the filter bank of its own sensor.
 
         Returns:
-            Steps (N, F, 1, 1) of the stream, then of each block.
+            The steps (N, F, 1, 1) of the maps between head and tail, then those of each block.
         """
         return [step.to(gains) / gains[:, None, None, None] for step in (self.stream, *self.inner)]
 
 
 class ConvBEERS(Layers):
-    """The network. It maps (N, 1, H, W) in [0, 1] of full scale to the same shape, without
-    clipping; H and W are multiples of its scale.
+    """The plain network, made for one sensor.
+
+    It restores images (N, 1, H, W) in [0, 1] of full scale, and does not clip the result. H and W
+    must be multiples of the scale of its variant.
     """
 
     def __init__(self, variant: Variant) -> None:
@@ -177,9 +180,9 @@ class Condition:
 
     Attributes:
         vectors: the sensor vectors (N, 4).
-        filters: (N, 5, 7, 7), see `Bank.filters`.
-        units: (N,) shares of full scale that correspond to 1 in the network's correction.
-        gains: (N,) see `Bank.gain`.
+        filters: the kernels (N, 5, 7, 7) that `Bank.filters` returns for each sensor.
+        units: the share of full scale that is 1 in the network's correction, (N,).
+        gains: the factor by which quantisation steps are finer, (N,), see `Bank.gain`.
     """
 
     vectors: Tensor
@@ -214,7 +217,7 @@ class Condition:
 
 
 class BankedConvBEERS(Layers):
-    """A network behind the bank of its sensor.
+    """A network for every sensor, which reads the image through the filter bank of its sensor.
 
     It maps images (N, 1, H, W) in [0, 1] of full scale and the description of their sensors to (N,
     1, H, W), without clipping. `kernels` names the kind of banks that it was trained behind.
@@ -236,7 +239,7 @@ class BankedConvBEERS(Layers):
         """Restore each image with the filters of its own sensor.
 
         Args:
-            image: (N, 1, H, W).
+            image: the raw images (N, 1, H, W) in [0, 1] of full scale.
             condition: description of the sensor of each image.
             bfloat16: whether the blocks compute in bfloat16.
             steps: step sizes to which the maps are rounded, see `Rounding.steps`; without steps
@@ -285,7 +288,7 @@ class OfOneSensor(nn.Module):
         self.variant = network.variant
 
     def forward(self, image: Tensor) -> Tensor:
-        """Restore (N, 1, H, W)."""
+        """Restore images (N, 1, H, W) in [0, 1] of full scale."""
         bank = self.bank or bank_of_vector(tuple(self.vector.tolist()), self.network.kernels)
         condition = Condition.of(self.vector[None], [bank])
         restored: Tensor = self.network(image, condition.repeated(len(image)))
@@ -324,8 +327,10 @@ def each_by_its_own(image: Tensor, kernels: Tensor) -> Tensor:
 
 
 def initialise(network: Network, generator: torch.Generator) -> None:
-    """Start as (nearly) the identity: He-normal weights, residual branches and correction scaled
-    down, the tail once more where it writes several pixels.
+    """Draw the first weights of a network, so that it changes images hardly at all.
+
+    Weights are He-normal. The last convolution of each residual branch and the tail are scaled
+    down, the tail once more if it writes several pixels.
     """
     for name, module in network.named_modules():
         if isinstance(module, nn.Conv2d):
@@ -355,7 +360,10 @@ def arrays(tensors: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
 
 
 def network_of(weights: Weights) -> Network:
-    """Build the network of some weights, plain or behind a bank, in evaluation mode on the CPU."""
+    """Build the torch network that has the given weights, in evaluation mode on the CPU.
+
+    It is a `ConvBEERS` for weights of a plain network, else a `BankedConvBEERS`.
+    """
     network: Network = ConvBEERS(weights.variant)
     if weights.conditioned:
         network = BankedConvBEERS(weights.variant, weights.kernels)

@@ -44,7 +44,19 @@ DRAWN_SIDE_PX = 3000
 
 @dataclass(frozen=True)
 class DatasetRecipe:
-    """The parameters that determine the pixels of a dataset."""
+    """The parameters that determine the pixels of a dataset of simulated pairs.
+
+    Attributes:
+        scenes: the files of the scenes; None is a scene that is drawn from the seed.
+        degraded: the sensor of the images to restore.
+        reference: the sensor of the images that a restoration aims at.
+        oversampling: the number of scene pixels per pixel of a pair, along each side.
+        patch_px: the side of a pair in pixels; None takes whole scenes.
+        radiance_scale: a factor on the radiance of every scene.
+        seed: the seed of drawn scenes, sensors and noise.
+        tolerance_dn: the simulator leaves out effects that change no pixel by more, in DN.
+        scene_scale: a factor on the size of every scene.
+    """
 
     scenes: tuple[Path | None, ...]  # None stands for a drawn scene.
     degraded: Sensor
@@ -113,7 +125,7 @@ def _scene_windows(recipe: DatasetRecipe, index: int, first: int) -> Iterator[Wi
 
 
 def load(recipe: DatasetRecipe, index: int) -> Scene:
-    """Load a scene of the recipe, with its radiance and size scaled."""
+    """Load or draw the scene of this index in `recipe.scenes`, and scale its radiance and size."""
     path = recipe.scenes[index]
     if path is None:
         generator = Draw(recipe.seed, index).generator("drawn scene")
@@ -136,7 +148,7 @@ class Patch(NamedTuple):
 
 
 def make_patches(recipe: DatasetRecipe, windows: list[Window]) -> list[Patch]:
-    """Simulate some patches of one scene."""
+    """Simulate the patches of the given windows, which must all lie in one scene."""
     radiance = load(recipe, windows[0].scene).radiance
     return [_make_patch(recipe, window, radiance) for window in windows]
 

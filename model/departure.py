@@ -30,10 +30,12 @@ and more (measured).
 
 
 def departure(sensor: Instrument, kernels: Kernels) -> str:
-    """Return a warning where a sensor's MTF has another curve than the formula's; "" if it has not.
+    """Return a warning if a sensor's MTF curve differs from the one that networks were trained on.
+
+    That is the curve of the formula exp(-gamma f) sinc f. Without a difference the text is empty.
 
     Args:
-        sensor: its MTF and smear are used.
+        sensor: the instrument whose MTF and smear are compared.
         kernels: the kind of the network's banks. Networks behind cut kernels were trained on the
             formula's curve only, those behind fitted ones on many.
     """
@@ -50,7 +52,9 @@ def departure(sensor: Instrument, kernels: Kernels) -> str:
 
 
 def has_other_curve(sensor: Instrument) -> bool:
-    """Return True if a sensor's MTF differs from the formula's of that contrast at Nyquist."""
+    """Return True if a sensor's MTF curve differs by more than `departure` allows from the curve
+    exp(-gamma f) sinc f that has the same contrast at Nyquist.
+    """
     return bool(_outside(sensor, "cut"))
 
 

@@ -47,8 +47,10 @@ at twice 4 dB (measured).
 
 
 def factors_for(sensor: Instrument) -> tuple[int, ...]:
-    """Return the factors that a network conditioned on `sensor` can use, 1 among them, in rising
-    order.
+    """Return the exposure factors that a network conditioned on `sensor` can use, in rising order.
+
+    An exposure factor multiplies the pixel values of dark ground before the network; 1 is always
+    among them.
 
     A factor raises the noise over full scale. It is excluded if the noise exceeds the training
     range by more than NOISE_BEYOND.

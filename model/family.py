@@ -59,7 +59,11 @@ class SensorVector:
 
 
 def sensor_values(sensor: Instrument) -> dict[str, float]:
-    """Compute the four values of `RANGES`, including smear and rounding noise."""
+    """Compute the four numbers that describe a sensor to a network, by the names of `RANGES`.
+
+    They are its MTF at Nyquist across and along the track, including smear, and its noise in dark
+    and in bright ground as a share of full scale, including rounding to integers.
+    """
     # A network knows no smear of its own: what that leaves of the contrast along the track is
     # counted there.
     smear_contrast = abs(float(np.sinc(0.5 * sensor.smear_px)))
@@ -81,7 +85,10 @@ def noise_over_full_scale(sensor: Instrument, part: int = 4) -> float:
 
 
 def sensor_vector(sensor: Instrument) -> SensorVector:
-    """Compute the sensor vector, clamped to the ranges."""
+    """Compute the vector on which a network is conditioned: the `sensor_values`, scaled to [-1, 1].
+
+    Values outside the ranges of training are clamped to them and named in the result.
+    """
     values = sensor_values(sensor)
     entries = list[float]()
     outside = list[str]()

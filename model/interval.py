@@ -72,13 +72,14 @@ MOST_QUANTILE = 1e3
 
 @dataclass(frozen=True)
 class Exponents:
-    """How a half-width grows.
+    """The exponents by which the half-width of a pixel grows with detail, blur and noise.
 
     Attributes:
-        detail: d, with s / sigma.
-        blur: b, with the logarithm of the MTF.
-        detail_by_blur: k, the change of d with the logarithm of the MTF.
-        noise: c, with the logarithm of the noise over full scale.
+        detail: d, the exponent of the local detail s / sigma (the deviation of nearby restored
+            pixels over that of the noise).
+        blur: b, the factor of the logarithm of the MTF at Nyquist.
+        detail_by_blur: k, the change of d with the logarithm of the MTF at Nyquist.
+        noise: c, the factor of the logarithm of the noise over full scale.
     """
 
     detail: float
@@ -110,7 +111,7 @@ class PixelInterval:
     acquisitions: int
 
     def for_sensor(self, sensor: Instrument, full_scale: float, level: Level) -> "HalfWidth":
-        """Return the half-width of images of a sensor.
+        """Prepare the half-widths for images of one sensor at one level.
 
         Args:
             sensor: the sensor that acquired the raw images.
@@ -144,11 +145,11 @@ class PixelInterval:
         """Read an interval from the metadata of a file, which is not trusted.
 
         Args:
-            text: what `to_json` returned.
+            text: the line that `to_json` returned.
             name: the name of the file, for the message.
 
         Raises:
-            ModelError: anything else.
+            ModelError: the text is not such a line, or a number in it is out of range.
         """
         try:
             record: Any = parse_json(text)
@@ -192,7 +193,7 @@ class HalfWidth:
     most: float
 
     def of(self, restored: NDArray[Any], known: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Return the half-widths of restored pixels, in their units.
+        """Compute the half-width of every restored pixel, in pixel values.
 
         Args:
             restored: (h, w) pixel values as they are stored.
@@ -213,7 +214,7 @@ def noise_and_detail(
     variances: tuple[float, float, float],
     offset: float,
 ) -> tuple[Array, Array]:
-    """Return sigma and s / sigma of every pixel, (h, w) each.
+    """Compute the noise sigma and the local detail s / sigma of every pixel, (h, w) each.
 
     Sums of integers are exact in float64, so that a window gives the same numbers in any tile.
 

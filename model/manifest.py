@@ -21,12 +21,18 @@ DIGESTS = "sha256"
 
 
 def image_of(out: Path, role: str, name: object) -> Path:
-    """Return the path in a dataset of an image of the pair `name`."""
+    """Return the path of one image of a pair in a dataset.
+
+    Args:
+        out: the dataset's folder.
+        role: "degraded" or "reference", the subfolder.
+        name: the name of the pair.
+    """
     return out / role / f"{name}.tif"
 
 
 def line_text(out: Path, line: Line) -> str:
-    """Return a pair's line of the manifest, once both images are written.
+    """Return the line that records a pair in the manifest, with the digests of its written images.
 
     Args:
         out: the dataset's folder.
@@ -38,12 +44,13 @@ def line_text(out: Path, line: Line) -> str:
 
 
 def matching_lines(out: Path, files: Iterable[Path]) -> dict[tuple[int, str], str]:
-    """Return the lines of some manifests that match their digests and images, by number and name of
-    the pair.
+    """Return the lines of manifests whose images still have the recorded digests.
+
+    The keys of the result are the number and the name of the pair.
 
     Args:
         out: the dataset's folder.
-        files: manifests, or parts of one; one that is not there is passed over.
+        files: paths of manifests, or of parts of one; missing files are skipped.
     """
     texts: dict[tuple[int, str], str] = {}
     for path in files:

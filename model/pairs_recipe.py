@@ -16,7 +16,14 @@ from beers_deploy.profiles.validation import validated
 
 @dataclass(frozen=True)
 class PairsRecipe:
-    """The sensors that made a folder of pairs, and their scenes."""
+    """The recipe next to a folder of simulated pairs: the sensors and scenes that made them.
+
+    Attributes:
+        degraded: the sensor of the images to restore.
+        reference: the sensor of the reference images.
+        scenes: the name of each scene's photograph by the number of the scene; None if it is
+            drawn.
+    """
 
     degraded: Sensor
     reference: Sensor
@@ -61,8 +68,8 @@ def profiles_for(
     """Return the profiles of the degraded and the reference images.
 
     Args:
-        sensor: the named sensor; None for that of the recipe, or the default.
-        reference: the named reference, likewise.
+        sensor: the sensor that the user names; None for that of the recipe, or the default one.
+        reference: the reference sensor that the user names; None as for `sensor`.
         recipe: the recipe of the pairs; a named sensor must agree with it. None if there is none.
     """
     if recipe is None:

@@ -32,7 +32,10 @@ _decided: dict[str, str] = {}
 
 
 def decided() -> dict[str, str]:
-    """Return the questions answered in this process so far, with the answers in words."""
+    """Return what this process has found out about its processor, for the log of a run.
+
+    A key names the question, such as "int8 on onnxruntime"; its value is the answer in words.
+    """
     return dict(_decided)
 
 

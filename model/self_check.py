@@ -83,7 +83,8 @@ SMOOTH = 2
 
 @dataclass(frozen=True)
 class Judged:
-    """The measurements of the blocks of an image, (n, m) each; NaN if too few pixels count.
+    """The self-check's measurements of an image: arrays (n, m) with one value for each block, which
+    is NaN if too few of its pixels count.
 
     Attributes:
         chi2: the mean squared residual over the variance of the noise, whose smooth part counts
@@ -110,9 +111,9 @@ class SelfCheck:
     """The self-check for images of one sensor.
 
     Attributes:
-        rows: (terms, 2 REACH_PX + 1); H's kernel is the sum of the terms' products of a row and a
-            column.
-        columns: likewise.
+        rows: the filters along rows, (terms, 2 REACH_PX + 1). The kernel of the blur H is the sum
+            over the terms of the product of a row filter and a column filter.
+        columns: the filters along columns, of the same shape.
         variances: the variances of the noise in squared pixel values: in the dark, its growth with
             the light, and its growth with the squared light.
         offset: the pixel value of the dark.
@@ -157,13 +158,13 @@ class SelfCheck:
         Args:
             raw: y, (h, w) pixel values, NaN where a pixel is missing; they reach REACH_PX beyond
                 the kept pixels, as far as the image does.
-            restored: x, (h, w) likewise.
+            restored: x, the restored pixels (h, w) at the same places.
             down: where the rows lie, and which are kept; the kept ones begin at a multiple of
                 BLOCK_PX.
-            across: where the columns lie, likewise.
+            across: where the columns lie, and which are kept, in the same way.
 
         Returns:
-            The figures of the blocks of the kept pixels, (n, m) each.
+            The measurements of the blocks of the kept pixels, (n, m) each.
         """
         missing = np.isnan(raw) | np.isnan(restored)
         # Only far tails of the kernel see the filling, because pixels near it do not count.

@@ -28,11 +28,11 @@ sensor vector.
 
 @dataclass(frozen=True)
 class Variant:
-    """A named point of the family.
+    """The size of a network, by which the shipped ones are named.
 
     Attributes:
-        blocks: residual blocks.
-        features: channels of the maps between head and tail.
+        blocks: the number of residual blocks.
+        features: the number of channels of the maps between head and tail.
         scale: side in pixels of the square that is one place of the maps; images have multiples of
             it as sides.
     """
@@ -50,7 +50,9 @@ class Variant:
 
     @property
     def convolutions(self) -> Mapping[str, tuple[int, int]]:
-        """(outputs, inputs) of each 3 x 3 convolution by name, in the order of computation."""
+        """The numbers of output and input channels of each 3 x 3 convolution, by name and in the
+        order of computation.
+        """
         places = product(range(self.blocks), ("first", "second"))
         body = [f"body.{block}.{place}" for block, place in places]
         square = (self.features, self.features)
@@ -70,8 +72,8 @@ class Variant:
 
     @property
     def banked_shapes(self) -> dict[str, tuple[int, ...]]:
-        """The same as `shapes`, behind a bank of four filters: the head reads their planes and the
-        sensor vector.
+        """The shape of each weight and bias of a network behind a filter bank, by name. Its head
+        reads the planes of four filters and the sensor vector in place of the image.
         """
         head = self.features, BANK_PLANES * self.pixels, 3, 3
         return {**self.shapes, "head.weight": head, "bias.weight": (self.features, SENSOR_VALUES)}

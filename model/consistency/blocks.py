@@ -101,8 +101,13 @@ def extend(
 
 
 def weighted_sums(image: Image, weights: Image, axis: int, block_px: int = BLOCK_PX) -> Image:
-    """Return weighted sums over windows along an axis, as long as `weights` and `block_px`
-    apart.
+    """Compute weighted sums over windows of pixels along an axis.
+
+    Args:
+        image: the pixels (h, w).
+        weights: the weight of each pixel of a window, whose length it gives.
+        axis: the axis of the windows, 0 or 1.
+        block_px: the distance between the starts of neighbouring windows in pixels.
     """
     count = (image.shape[axis] - len(weights)) // block_px + 1
     end = block_px * (count - 1) + 1
@@ -116,7 +121,9 @@ def weighted_sums(image: Image, weights: Image, axis: int, block_px: int = BLOCK
 
 
 def block_means(image: Image, block_px: int = BLOCK_PX) -> Image:
-    """Return the means of whole blocks."""
+    """Return the mean of each block of `block_px` x `block_px` pixels. The sides of the image must
+    be multiples of `block_px`.
+    """
     mean = np.full(block_px, 1 / block_px, np.float32)
     return weighted_sums(weighted_sums(image, mean, 0, block_px), mean, 1, block_px)
 
@@ -141,7 +148,7 @@ def interpolate(blocks: Image, down: Placed, across: Placed, block_px: int = BLO
     Args:
         blocks: values of all blocks of `block_px` pixels within `down.blocks` and `across.blocks`.
         down: where the rows lie, and which are kept.
-        across: where the columns lie, likewise.
+        across: where the columns lie, and which are kept.
         block_px: side of a block, 8 or a divisor of it that is even.
     """
     return _along(_along(blocks, down, block_px).T, across, block_px).T

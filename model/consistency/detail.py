@@ -39,11 +39,11 @@ on photographs of training places); single pixels would add more noise than deta
 
 
 def products_per_px(terms: int, near_px: int) -> float:
-    """Return the number of multiply-accumulate operations of the step per pixel.
+    """Return the number of multiply-accumulate operations per pixel of the step for finer detail.
 
     Args:
-        terms: separable filters of H's near part.
-        near_px: its radius.
+        terms: the number of separable filters that make up the near part of the blur H.
+        near_px: the radius of these filters in pixels.
     """
     window_px = FINE_PX + 2 * near_px
     near = terms * window_px * (1 / FINE_PX + 1 / FINE_PX**2)
@@ -73,7 +73,7 @@ class DetailStep:
 
         Args:
             raw: y, the pixels of all blocks of `down` and `across`.
-            restored: x, the same with NEAR_PX more on every side.
+            restored: x, the restored pixels of these blocks, with NEAR_PX more on every side.
             down: where the rows lie, and which are kept.
             across: where the columns lie, likewise.
 

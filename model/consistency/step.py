@@ -177,8 +177,8 @@ class Consistency:
         Args:
             raw: y, (h, w) pixel values; they reach RAW_REACH_PX beyond the kept pixels, as far as
                 the image does.
-            restored: x, (h', w'), NaN where a pixel is missing; it reaches REACH_PX beyond,
-                likewise.
+            restored: x, the restored pixels (h', w'), NaN where one is missing. They reach REACH_PX
+                beyond the kept pixels, as far as the image does.
             down: where the rows of `restored` lie in the image, and which are kept.
             across: where its columns lie, and which are kept.
             raw_at: row and column in the image of the first pixel of `raw`.
