@@ -61,7 +61,7 @@ def other_format(head: bytes) -> OtherFormat | None:
     """Return the format of a file that is not ONNX, or None if it is not recognised.
 
     Args:
-        head: its first bytes.
+        head: the first bytes of the file.
     """
     # torch.save writes a ZIP archive that holds data.pkl.
     if head.startswith(b"PK\x03\x04"):

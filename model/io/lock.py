@@ -30,8 +30,8 @@ NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, ENOTSUP
 
 @contextmanager
 def only_run(out: Path) -> Iterator[None]:
-    """Lock the folder in which a run stores its temporary files for `out`, and remove it at the
-    end.
+    """Lock and create the folder of a run's temporary files, so that no second run writes the same
+    `out`; remove the folder at the end.
 
     The folder remains if it still contains rows. Parent folders that were created for it are
     removed too, unless something was written there. On a disk without locks, such as some network

@@ -46,10 +46,10 @@ def stretch_of(dn: np.ndarray) -> Stretch:
 
 
 def busiest_windows(dn: np.ndarray, side_px: int) -> list[tuple[int, int]]:
-    """Return (top, left) of the windows with the strongest gradients in the upper and in the lower
-    half.
+    """Find the windows with the strongest gradients in the upper and the lower half of an image.
 
-    Returns a single window if the image is too low for two.
+    Returns:
+        The position (top, left) of both windows, or of one if the image is too low for two.
     """
     half = dn.shape[0] // 2
     if half < side_px:
@@ -87,11 +87,11 @@ def strip(
     one row per window.
 
     Args:
-        images: by name; all of one shape.
-        windows: (top, left) of each crop.
-        side_px: side of a crop.
-        zoom: width of an image pixel in the picture, without smoothing.
-        stretch: for all images.
+        images: the images by name; all have the same shape.
+        windows: the position (top, left) of each crop.
+        side_px: the side of a crop in pixels.
+        zoom: the number of pixels of the picture per pixel of an image, along each side.
+        stretch: the stretch of all images.
     """
     rows = [
         strip_row(
@@ -118,7 +118,7 @@ def grid(names: list[str], rows: list[list[np.ndarray]], zoom: int) -> Image.Ima
     Args:
         names: the names of the columns.
         rows: cells (h, w), or all of them (h, w, 3).
-        zoom: width of a cell's pixel in the picture.
+        zoom: the number of pixels of the picture per pixel of a cell, along each side.
     """
     height, width = (side * zoom for side in rows[0][0].shape[:2])
     size = len(names) * (width + GAP_PX) - GAP_PX, len(rows) * (height + GAP_PX) + LABEL_PX

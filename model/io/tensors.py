@@ -40,11 +40,16 @@ Arrays = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Weights:
-    """The content of a weights file. A conditioned network accepts a sensor and stands behind its
-    bank.
+    """The content of a weights file.
 
-    `kernels` names the kind of kernels of that bank, and `interval` is its calibrated interval
-    (`model.interval`), empty without one.
+    Attributes:
+        tensors: the weights and biases by name.
+        variant: the size of the network.
+        recipe: how the network was trained, for its model card.
+        conditioned: True if one set of weights serves every sensor: the network then reads the
+            image through a filter bank computed from the sensor.
+        kernels: the kind of kernels of this bank.
+        interval: the calibrated interval of its errors as text (`model.interval`); "" without one.
     """
 
     tensors: Arrays

@@ -37,9 +37,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class PreparedScene:
-    """A scene (H, W) in W/m2/sr/um, with the results that several sensors share, so that they are
-    computed once.
-    """
+    """A scene, with its spectrum and statistics, which are computed once for several sensors."""
 
     radiance: np.ndarray
     oversampling: int
@@ -56,7 +54,13 @@ class PreparedScene:
 
 
 def prepare_scene(radiance: np.ndarray, oversampling: int) -> PreparedScene:
-    """Crop a scene (H, W) to whole target pixels: H and W become multiples of `oversampling`."""
+    """Crop a scene for sensors that see `oversampling` x `oversampling` of its pixels as one.
+
+    Args:
+        radiance: the radiance (H, W) of the scene in W/m2/sr/um.
+        oversampling: the number of scene pixels per pixel of a sensor, along each side. The sides
+            of the scene become multiples of it.
+    """
     return PreparedScene(crop_divisible(radiance, oversampling), oversampling)
 
 
@@ -76,7 +80,7 @@ def simulate_planned(
         draw: seed and patch number of the random effects.
         plan: the decision for each effect.
         role: "degraded" or "reference"; keeps the two noises of a pair independent.
-        margin_px: target pixels cropped on each side.
+        margin_px: the number of pixels of the image that are cropped on each side.
 
     Returns:
         Digital numbers (H / r - 2 margin, W / r - 2 margin).
@@ -119,9 +123,9 @@ def simulate_pair(
         radiance: the scene.
         degraded: the sensor of the first image.
         reference: the sensor of the second image.
-        oversampling: r, scene pixels per target pixel.
+        oversampling: r, the number of scene pixels per pixel of the sensors, along each side.
         draw: seed and patch number of the random effects.
-        margin_px: target pixels cropped on each side.
+        margin_px: the number of pixels of the image that are cropped on each side.
 
     Returns:
         The pair, each (..., H / r - 2 margin, W / r - 2 margin).
@@ -149,15 +153,15 @@ def acquire(
     """Simulate one acquisition: blur and sampling, then `detect` on the target grid.
 
     Args:
-        spectrum: see `sampling.scene_spectrum`.
-        width: W of the scene in pixels.
+        spectrum: the half spectrum of the scene, as `sampling.scene_spectrum` returns it.
+        width: the width W of the scene in pixels.
         sensor: the instrument.
-        oversampling: scene pixels per target pixel.
+        oversampling: the number of scene pixels per pixel of the sensor, along each side.
         draw: seed and patch number of the random effects.
         role: "degraded" or "reference"; keeps the two noises of a pair independent.
-        offset_px: sub-pixel phase of the sampling grid, in scene pixels.
-        margin_px: target pixels cropped on each side.
-        skip: effects to omit in `detect`.
+        offset_px: the shift (down, right) of the sampling grid, in scene pixels.
+        margin_px: the number of pixels of the image that are cropped on each side.
+        skip: the names of effects that `detect` leaves out.
 
     Returns:
         Digital numbers (h, w).
@@ -174,7 +178,8 @@ def acquire_three(
     """Simulate a pair of one scene, and the reference once more without noise and rounding.
 
     Returns:
-        Digital numbers (h, w) each.
+        The degraded image, the reference, and the reference without noise: digital numbers (h, w)
+        each.
     """
 
     def by(sensor: Instrument, role: str, skip: Collection[str] = ()) -> np.ndarray:
@@ -202,7 +207,7 @@ def acquire_padded(
     Args:
         radiance: the scene (H, W) in W/m2/sr/um.
         sensor: the instrument.
-        oversampling: scene pixels per target pixel.
+        oversampling: the number of scene pixels per pixel of the sensor, along each side.
         draw: seed and patch number of the random effects.
         role: "degraded" or "reference"; keeps the two noises of a pair independent.
 
@@ -223,8 +228,8 @@ def fitting_oversampling(
 
     Args:
         radiance: the scene (H, W).
-        oversamplings: candidates, in order of preference.
-        side_px: the least side without margins.
+        oversamplings: the candidates, in order of preference.
+        side_px: the smallest side, in pixels, that an image must keep within its margins.
     """
     target_px = side_px + 2 * MARGIN_PX
     return next(

@@ -102,8 +102,8 @@ def detect(
     """Compute the digital numbers of a blurred, sampled signal (..., H, W) in W/m2/sr/um.
 
     Args:
-        signal: radiance on the target grid.
-        sensor: the instrument; it has an effect if it has its table.
+        signal: the radiance at each pixel of the sensor.
+        sensor: the instrument. An effect is simulated if the profile has a table for it.
         draw: seed and patch number; each effect derives its own generator from it.
         role: "degraded" or "reference", so that the two draws of a pair differ.
         skip: effects to omit, see `plan.Plan.skipped`; without "digitising" digital numbers are

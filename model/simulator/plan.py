@@ -86,8 +86,7 @@ def smear_moments(height: int, oversampling: int, length_px: float) -> tuple[flo
 
 
 def behind(name: str, change_dn: float, sensor: Instrument) -> float:
-    """Bound the change of a pixel after all later effects, if the effect `name` changes the signal
-    by `change_dn`.
+    """Bound the change of a pixel by one effect, after all later effects have acted on it too.
 
     Blooming adds its share, PRNU its largest gain, and noise changes with the signal: |sqrt(a) -
     sqrt(b)| <= min(sqrt|a - b|, |a - b| / (2 sqrt(beta))).
@@ -124,7 +123,11 @@ PIXEL_EFFECTS = {name: kind for name, kind in TABLES.items() if issubclass(kind,
 
 
 def costs(acts_on: str) -> dict[str, str]:
-    """Return the cost of each effect on radiance, or on DN."""
+    """Return what each effect costs in computing time, in words, by the name of the effect.
+
+    Args:
+        acts_on: what the effects change, "radiance" or "DN".
+    """
     return {name: kind.cost for name, kind in PIXEL_EFFECTS.items() if kind.acts_on == acts_on}
 
 
@@ -148,7 +151,15 @@ UNSEEN = {"mtf": "the scene is constant"} | {
 
 @dataclass(frozen=True)
 class Decision:
-    """The decision about one effect, and its reason."""
+    """The decision whether the simulation of a scene needs one effect.
+
+    Attributes:
+        effect: the name of the effect.
+        choice: applied, or the kind of reason for which it is skipped.
+        why: the reason in words.
+        bound_dn: the largest change of any pixel by the effect, in DN; None if no bound is known.
+        cost: what the effect costs in computing time, in words.
+    """
 
     effect: str
     choice: Choice
@@ -160,7 +171,12 @@ class Decision:
 
 @dataclass(frozen=True)
 class Plan:
-    """The decisions of one acquisition, in the order of the light."""
+    """The decisions about all effects of one acquisition, in the order in which light passes them.
+
+    Attributes:
+        decisions: a decision for each effect.
+        tolerance_dn: the largest change, in DN, by all effects that are skipped as negligible.
+    """
 
     decisions: tuple[Decision, ...]
     tolerance_dn: float

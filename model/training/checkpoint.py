@@ -28,13 +28,14 @@ class TrainingRecipe:
 
     Attributes:
         steps: the number of gradient steps.
-        batch: patches per step, on every worker.
-        learning_rate: the highest, after warm-up.
-        warm_up_steps: the number of steps of a linear rise from 0.
-        gradient_norm: larger gradients are clipped to it; the L1 loss of a restoration is small, so
-            that a far larger one is a burst.
-        ema_decay: decay of the running average of the weights, which is shipped.
-        loss: weights of the loss's terms.
+        batch: the number of patches of a step on each worker.
+        learning_rate: the highest learning rate, which is reached after the warm-up.
+        warm_up_steps: the number of steps in which the learning rate rises linearly from 0.
+        gradient_norm: the norm to which larger gradients are clipped. The L1 loss of a restoration
+            is small, so that a far larger gradient is a burst.
+        ema_decay: the decay per step of the running average of the weights. The average becomes the
+            network.
+        loss: the weight of each term of the loss.
         seed: the seed of the first weights and of the patches.
         rounding: the digest of the INT8 file whose rounding is applied to the maps; "" for no
             rounding.
@@ -133,7 +134,7 @@ def require_finite_output(
     Finite weights do not exclude that, because their sums may overflow.
 
     Args:
-        network: on the CPU; a conditioned one is given the middle of every range.
+        network: the network, on the CPU. A conditioned one is given the middle of every range.
         name: the name of the network, in the message.
         remedy: the last sentence of the message.
     """
@@ -166,13 +167,13 @@ def read_checkpoint(
     """Read and validate a checkpoint, or raise ModelError.
 
     Args:
-        path: the file.
-        network: a network of the same size.
+        path: the file of the checkpoint.
+        network: a network of the size that the checkpoint must have.
         recipe: the recipe with which the training was begun.
         data: digest of all data that the training learns from.
 
     Returns:
-        Its tensors by name (see `Trainer.save`), its step and its guards.
+        The tensors by name (see `Trainer.save`), the number of steps done, and the guards.
     """
     parts, header = read_tensors(path)
     tensors = {name: torch.from_numpy(array) for name, array in parts.items()}
@@ -207,7 +208,11 @@ def read_checkpoint(
 
 
 def finish(network: Network, path: Path, recipe: dict[str, object]) -> None:
-    """Write a network with the recipe that made it."""
+    """Write the weights of a trained network to a file, with the recipe in its header.
+
+    Raises:
+        ModelError: the network returns NaN or infinity.
+    """
     if not all_finite(arrays(network.state_dict())):
         raise ModelError(
             f"The trained weights for {path} contain NaN or infinity. Lower the learning rate."

@@ -20,10 +20,10 @@ class Look:
     """The appearance of a scene in one acquisition: its light, contrast and softness.
 
     Attributes:
-        light: factor on the scene's radiance.
-        contrast: share of the contrast around the scene's mean that is left.
-        softness_px: standard deviation of a further blur of the ground, in target pixels; 0 is
-            none.
+        light: a factor on the radiance of the scene.
+        contrast: the share that is left of the contrast around the mean of the scene.
+        softness_px: the standard deviation of a Gaussian by which the ground itself is blurred, in
+            pixels of the images; 0 for no blur.
     """
 
     light: float
@@ -34,16 +34,18 @@ class Look:
 @with_config(CONFIG)
 @dataclass(frozen=True)
 class Looks:
-    """The distribution from which looks are drawn.
+    """The distribution from which a training draws the look of each pass over a scene.
 
     Attributes:
-        exposures: light of an ordinary day, uniform: darker and brighter than the photograph's.
-        lit_share: share of the passes with any light.
-        lights: from deep shade to saturated areas, log-uniform.
-        calm_share: share of the passes with reduced contrast.
-        contrasts: share of the contrast that is left in them, log-uniform.
-        soft_share: share of the passes over softer ground.
-        softness_px: in target pixels, uniform.
+        exposures: the range of the light of ordinary passes, as a factor on the photograph's; drawn
+            uniformly.
+        lit_share: the share of the passes whose light is drawn from `lights` instead.
+        lights: the range of this factor, from deep shade to saturated areas; drawn log-uniformly.
+        calm_share: the share of the passes with reduced contrast.
+        contrasts: the range of the share of contrast that is left in them; drawn log-uniformly.
+        soft_share: the share of the passes over ground that is blurred further.
+        softness_px: the range of the standard deviation of that blur, in pixels of the images;
+            drawn uniformly.
     """
 
     exposures: Range = (0.5, 1.25)

@@ -32,7 +32,7 @@ from beers_deploy.profiles.validation import CONFIG, Amount
 @with_config(CONFIG)
 @dataclass(frozen=True)
 class LossWeights:
-    """The weight of each term; a term of weight 0 is not computed.
+    """The weight of each term of the training loss; a term of weight 0 is not computed.
 
     `coarse` is the share, in all terms, of the part of an error that the consistency step removes.
     """
@@ -82,8 +82,10 @@ class RestorationLoss:
 
 
 def coarse(error: Tensor) -> Tensor:
-    """Average (N, 1, H, W) over whole blocks, and interpolate bilinearly between the centres of the
-    blocks.
+    """Compute the part of an error (N, 1, H, W) that the consistency step would remove.
+
+    The error is averaged over whole blocks, and the means are interpolated bilinearly between the
+    centres of the blocks.
     """
     means = avg_pool2d(error, BLOCK_PX)
     interpolated: Tensor = interpolate(

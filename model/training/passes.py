@@ -31,11 +31,11 @@ error of 1e-4 at most.
 
 @dataclass(frozen=True)
 class Visited:
-    """A scene whose spectrum is computed.
+    """A scene with its Fourier transform, which all acquisitions of a pass share.
 
     Attributes:
-        spectrum: (H, W // 2 + 1) complex64.
-        width: W in pixels.
+        spectrum: the half spectrum of its radiance, (H, W // 2 + 1) complex64.
+        width: the width W of the scene in pixels.
     """
 
     spectrum: Tensor
@@ -49,14 +49,15 @@ class Visited:
 
 @dataclass(frozen=True)
 class Pass:
-    """The parameters that the two acquisitions of a pass share.
+    """One simulated flight over a scene: the parameters that the degraded and the reference
+    acquisition share.
 
     Attributes:
-        oversampling: scene pixels per target pixel.
-        phase_px: shift (down, right) of the sampling grid in scene pixels; the same for both,
+        oversampling: the number of scene pixels per pixel of the images, along each side.
+        phase_px: the shift (down, right) of the sampling grid in scene pixels. Both have the same,
             because a restoration must not shift the image.
         look: the look of the ground.
-        margin_px: target pixels cropped on each side.
+        margin_px: the number of pixels of the images that are cropped on each side.
     """
 
     oversampling: int
@@ -66,19 +67,22 @@ class Pass:
 
 
 def prepare(scene: Scene, multiple: int, device: torch.device | str = "cpu") -> Visited:
-    """Crop a scene to multiples of every oversampling, and transform it once."""
+    """Crop a scene so that `multiple` divides its sides, and compute its spectrum."""
     radiance = np.ascontiguousarray(crop_divisible(scene.radiance, multiple))
     return Visited(torch.fft.rfft2(torch.from_numpy(radiance).to(device)), radiance.shape[-1])
 
 
 def folded_signals(scene: Visited, sensors: tuple[Instrument, ...], passage: Pass) -> list[Tensor]:
-    """Compute the blurred and sampled radiance (h, w) of each sensor on the target grid, without
-    the margin.
+    """Compute the radiance that each sensor samples in one pass over a scene: blurred, but without
+    noise.
 
     Args:
-        scene: with its spectrum.
-        sensors: the instruments.
+        scene: the scene and its spectrum.
+        sensors: the instruments, such as the degraded one and the reference.
         passage: the parameters of the pass.
+
+    Returns:
+        For each instrument the radiance (h, w) at its pixels, without the margin.
     """
     height, width = scene.sides
     device = scene.spectrum.device
@@ -113,12 +117,12 @@ def with_look(spectrum: Tensor, look: Look, fy: Tensor, fx: Tensor) -> Tensor:
 
     Args:
         spectrum: (H, W // 2 + 1) complex.
-        look: the look.
-        fy: vertical frequencies (H,) in cycles per target pixel.
-        fx: horizontal frequencies (W // 2 + 1,), likewise.
+        look: the light, contrast and softness to apply.
+        fy: vertical frequencies (H,) in cycles per pixel of the images.
+        fx: horizontal frequencies (W // 2 + 1,) in the same unit.
 
     Returns:
-        (H, W // 2 + 1) complex.
+        The changed half spectrum, (H, W // 2 + 1) complex.
     """
     ground = spectrum * (look.light * look.contrast)
     if look.softness_px:

@@ -23,10 +23,11 @@ class PatchRecipe:
         degraded: the profile from which the sensor of each pass is drawn.
         reference: the profile from which the sensor of the target image is drawn, in the units of
             `degraded`.
-        patch_px: side of a patch.
-        oversamplings: ratios to draw from; each shows the same ground at another scale.
+        patch_px: the side of a patch in pixels.
+        oversamplings: the numbers of scene pixels per pixel to draw from; each shows the same
+            ground at another scale.
         looks: how light, contrast and softness of the ground are drawn.
-        margin_px: target pixels cropped on each side.
+        margin_px: the number of pixels that are cropped on each side of a simulated image.
         family: the sensors to draw from instead of `degraded`. Each patch then comes with the
             description of its sensor, and dark patches are brightened as in a restoration.
         noisy_reference: whether the target image has the noise of the reference.

@@ -29,8 +29,8 @@ class Stage:
     Attributes:
         name: the name of its folder.
         steps: the number of gradient steps.
-        batch: patches per step.
-        learning_rate: the highest; a cosine leads it down to 0.
+        batch: the number of patches of a step.
+        learning_rate: the highest learning rate, which falls to 0 as a cosine.
         rounding: whether maps are rounded as in the INT8 file of the weights that the stage begins
             with.
         precision: the precision of the blocks, float32 or bfloat16.
@@ -52,17 +52,18 @@ class NetworkRecipe:
     """The complete parameters of a network's training.
 
     Attributes:
-        variant: its size.
-        stages: in order; each begins with the weights of the one before.
-        start: shipped network whose weights, grown, the first stage begins with; "" draws weights.
+        variant: the name of the network's size.
+        stages: the stages in order; each begins with the weights of the one before.
+        start: the name of a shipped network; the first stage begins with its weights, enlarged to
+            the size of `variant`. "" draws random weights.
         seed: the seed of weights, charts and patches; each stage adds its number.
-        patch_px: side of a patch.
+        patch_px: the side of a patch in pixels.
         charts: the number of drawn charts in addition to the images.
         held_out: sites that are not trained on, and by which a network is selected.
-        other_curves: share of sensors with an MTF of another curve than the formula's.
+        other_curves: the share of sensors whose MTF has another curve than exp(-gamma f) sinc f.
         looks: how light, contrast and softness of the ground are drawn.
-        loss: weights of its terms.
-        attribution: the attribution of the images.
+        loss: the weight of each term of the loss.
+        attribution: a line for each source of images, for the model card.
         notes: sentences for the model card.
     """
 
@@ -104,7 +105,7 @@ def load_recipe(name: str) -> NetworkRecipe:
     """Read a recipe.
 
     Args:
-        name: a shipped recipe's, or the path of a .toml file.
+        name: the name of a shipped recipe, or the path of a .toml file.
 
     Raises:
         ProfileError: no such recipe, a key that is unknown or missing, or a value that no training

@@ -55,7 +55,7 @@ differ by far more.
 
 @dataclass(frozen=True)
 class Run:
-    """The options of the command, or a stage of a recipe.
+    """One training run: the options of `train`, or one stage of a recipe.
 
     Attributes:
         held_out: sites that are not trained on; if none is named, a twentieth of the images is held
@@ -90,12 +90,12 @@ class Run:
 
 
 def train(run: Run, resume: bool, worker: Worker) -> None:
-    """Run or resume a training to its end, and log whether LPIPS is part of the loss.
+    """Train a network to the last step, and write its weights and its log.
 
     Args:
-        run: the options.
+        run: the options of the run.
         resume: whether to continue from the checkpoint of the run.
-        worker: this process among those of the run.
+        worker: the rank of this process among those that train together.
     """
     variant = variant_named(run.variant)
     require_whole_places(run, variant)
@@ -125,7 +125,7 @@ def train(run: Run, resume: bool, worker: Worker) -> None:
 
 
 def require_whole_places(run: Run, variant: Variant) -> None:
-    """Raise OptionError if a network at a lower resolution cannot rearrange the patches."""
+    """Raise OptionError if the side of the patches is no multiple of the network's scale."""
     if run.patches.patch_px % variant.scale:
         raise OptionError(
             f"`patch` must be a multiple of {variant.scale} px for a network at 1/{variant.scale} "
@@ -176,8 +176,8 @@ def data_sha256(run: Run, loss: RestorationLoss) -> str:
     the same.
 
     Args:
-        run: the options.
-        loss: with or without LPIPS, whose weights may be missing when the run is resumed.
+        run: the options of the run.
+        loss: the loss, with or without LPIPS, whose weights may be missing when the run is resumed.
     """
     patches = run.patches
     files = list(chain.from_iterable(map(list_images, run.images)))
@@ -287,8 +287,9 @@ def _train(run: Run, trainer: Trainer, batches: Batches, validation: Validation)
 
 
 class Log:
-    """A CSV file with one line per report. When a run is resumed, lines beyond its step are
-    removed.
+    """The log of a training: a CSV file with one line for each report of progress.
+
+    When a run is resumed, lines beyond its step are removed.
     """
 
     def __init__(self, path: Path, step: int) -> None:
@@ -316,7 +317,7 @@ class Log:
 def about(
     run: Run, images: Sequence[str], held_out: Sequence[str], loss: RestorationLoss
 ) -> dict[str, object]:
-    """Return the recipe that is stored in the header of the weights: everything but the machine."""
+    """Return the facts of a run for the header of its weights: everything but the machine."""
     patches = run.patches
     return {
         "training": asdict(run.recipe),

@@ -34,14 +34,13 @@ from beers_deploy.profiles.instrument import Instrument
 
 
 class Batch(NamedTuple):
-    """Patches (N, 1, P, P) in [0, 1]; for a conditioned network also the description of their
-    sensors.
+    """The patches of one training step.
 
     Attributes:
-        degraded: the input of the network.
-        reference: the target of the network.
-        condition: description of the sensor of each, oriented as the patch; None for a plain
-            network.
+        degraded: the input of the network, (N, 1, P, P) in [0, 1] of full scale.
+        reference: the result that the network should give, of the same shape.
+        condition: the description of the sensor of each patch, turned as the patch is; None for a
+            plain network.
     """
 
     degraded: Tensor
@@ -53,8 +52,8 @@ class Visit(NamedTuple):
     """The patches of one pass over a scene.
 
     Attributes:
-        patches: (N, 2, P, P), degraded and reference in [0, 1].
-        condition: description of the sensor of each; None without a family of sensors.
+        patches: the degraded and the reference image of each patch, (N, 2, P, P) in [0, 1].
+        condition: the description of the sensor of each patch; None without a family of sensors.
     """
 
     patches: Tensor
@@ -62,7 +61,7 @@ class Visit(NamedTuple):
 
 
 class PatchSource:
-    """Endless batches of patches; the same for the same seed."""
+    """A source of endless batches of simulated patches, which are the same for the same seed."""
 
     SHARD_BATCHES = 16
     """The number of batches that are shuffled together: enough scenes in one batch,

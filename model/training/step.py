@@ -34,8 +34,8 @@ class Inputs:
     Attributes:
         batch: the patches, and the description of their sensors.
         steps: step sizes to which maps are rounded; without any they are not rounded.
-        rate: learning rate.
-        share: weight of the new weights in their running average.
+        rate: the learning rate, a tensor of one number.
+        share: the share of the new weights in their running average, a tensor of one number.
     """
 
     batch: Batch
@@ -60,11 +60,11 @@ class Step:
     """One gradient step: forward, loss, backward, clipped gradients, Adam and the running average.
 
     Args:
-        network: on its device.
-        loss: function of its output.
+        network: the network to train, on its device.
+        loss: the function that computes the loss of its output.
         forward: the network, or a wrapper that averages its gradients over workers.
-        gradient_norm: larger gradients are clipped to it.
-        bfloat16: whether the blocks are computed in it.
+        gradient_norm: the norm to which larger gradients are clipped.
+        bfloat16: whether the blocks compute in bfloat16.
         rounding: how maps are rounded; None does not round them.
         agree: see `Agree`; None for a single worker.
 

@@ -44,8 +44,12 @@ from beers_deploy.profiles.errors import MachineError, OptionError
 
 @dataclass(frozen=True)
 class Worker:
-    """This process among those of the run; torchrun starts them and sets their environment
-    variables.
+    """One of the processes that train a network together, as torchrun starts them.
+
+    Attributes:
+        rank: the number of this process among all, from 0.
+        count: the number of processes.
+        local_rank: the number of this process among those of its host, which chooses its GPU.
     """
 
     rank: int = 0
@@ -78,7 +82,14 @@ class Worker:
 
 @contextmanager
 def joined(device: str) -> Iterator[Worker]:
-    """Join the run that torchrun started, or be the only one."""
+    """Join the processes that torchrun started, for as long as the block runs.
+
+    Args:
+        device: the name of the device of the training, such as "cpu" or "cuda".
+
+    Yields:
+        This process; the only one if torchrun started none.
+    """
     count = int(os.environ.get("WORLD_SIZE", "1"))
     if count == 1:
         yield Worker()
@@ -120,11 +131,11 @@ class Schedule:
 
 @dataclass(frozen=True)
 class Speed:
-    """The speed of some steps.
+    """The speed of the training since the last report.
 
     Attributes:
-        patches_per_s: patches trained on per second.
-        waited: share of the time in which the steps waited for patches.
+        patches_per_s: the number of patches per second.
+        waited: the share of the time in which the steps waited for patches.
     """
 
     patches_per_s: float
@@ -141,11 +152,11 @@ class Trainer:
     """One run: its network, running average, optimiser and step.
 
     Args:
-        variant: the network's size.
+        variant: the size of the network.
         recipe: the parameters of the run.
         loss: the loss that the recipe weights.
         worker: the rank of this process, and the number of processes that train together.
-        device: on which the steps are computed.
+        device: the device that computes the steps.
         start: a network of the same kind and size to continue from; None draws new weights.
         precision: number format of the body; it depends on the machine, and a resumed run may use
             another.
@@ -197,7 +208,7 @@ class Trainer:
 
         Args:
             batches: function that returns all batches from a number on.
-            checkpoint: the file.
+            checkpoint: the path of the checkpoint to write.
             schedule: when to report, validate and save; with several workers, the first does.
         """
         schedule = schedule if self.worker.first else Schedule()

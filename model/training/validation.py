@@ -73,7 +73,8 @@ def split_by_site(
 
 
 class Validation:
-    """Pairs (1, 1, H, W) in [0, 1] from scenes that are not trained on, the same in every run.
+    """The pairs by which a training is judged: images (1, 1, H, W) in [0, 1] of scenes that are not
+    trained on, the same in every run.
 
     Scenes that are too small for the margin are excluded.
     """
