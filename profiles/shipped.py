@@ -28,12 +28,20 @@ TILE_PX = 640
 
 
 def shipped_names(kind: str) -> list[str]:
-    """Return the names of the profiles shipped in `profiles/KIND/`."""
+    """Return the sorted names of the profiles shipped in `profiles/KIND/`: "sensors", "scenes" or
+    "targets".
+    """
     return sorted(path.stem for path in (HERE / kind).glob("*.toml"))
 
 
 def profile_path(kind: str, name: str) -> Path:
-    """Return the path of a profile: in `profiles/KIND/`, or the user's own path."""
+    """Return the path of a profile's TOML file; it need not exist.
+
+    Args:
+        kind: the folder of shipped profiles: "sensors", "scenes" or "targets".
+        name: the name of a shipped profile, or the path of the user's own file, which ends in
+            .toml.
+    """
     return Path(name) if name.endswith(".toml") else HERE / kind / f"{name}.toml"
 
 
@@ -48,7 +56,7 @@ def scene_names() -> list[str]:
 
 
 def target_names() -> list[str]:
-    """Return the names of the shipped targets."""
+    """Return the names of the shipped targets, the processing boards."""
     return shipped_names("targets")
 
 
