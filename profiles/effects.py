@@ -261,7 +261,9 @@ class Offset(PixelEffect):
 
 @dataclass(frozen=True)
 class Defects(PixelEffect):
-    """Dead pixels (always 0) and hot ones (always full scale), per million; 0 is none."""
+    """Faulty pixels: dead ones (always 0) and hot ones (always full scale), each per million
+    pixels; 0 is none.
+    """
 
     dead_per_million: Annotated[float, Limits(0.0, 1e6)]
     hot_per_million: Annotated[float, Limits(0.0, 1e6)]

@@ -130,7 +130,9 @@ class MachineError(BeersError, RuntimeError):
 
 
 class MissingExtraError(MachineError, ImportError):
-    """An optional package is not installed. The message names the extra that installs it."""
+    """An optional package is not installed or does not load. The message names the extra that
+    installs it.
+    """
 
 
 CODE_FAULTS = (AttributeError, ImportError, NameError, TypeError)

@@ -383,6 +383,10 @@ def apart(own: MtfCurve, other: MtfCurve) -> MtfCurve:
 
     The loss along an edge's normal is sqrt((c loss_own)^2 + (s loss_other)^2), with c and s the
     cosine and sine of its angle, as in a profile's formula (`profiles.response.MtfTable`).
+
+    Args:
+        own: the curve to correct.
+        other: the curve measured along the other axis, not corrected either.
     """
     detector = np.sinc(FREQUENCIES)
     own_loss, other_loss = (np.log(detector / curve.contrast) ** 2 for curve in (own, other))

@@ -280,8 +280,8 @@ def _solve(
         x: (P,) columns of a region's pixels.
         y: (P,) their rows.
         values: (N, P) pixels.
-        mask: (N, P) which of them count.
-        shape: the shape of the curve.
+        mask: (N, P) bool, True for the pixels near each edge, which are fitted.
+        shape: the coefficient of the curve's Gaussian part.
     """
     lean = np.sqrt(1 + lines.slope**2)[:, None]
     distance = (x - lines.place[:, None] - lines.slope[:, None] * y) / lean

@@ -304,8 +304,12 @@ def is_restored(software: str, metadata: object) -> bool:
 
 
 def require_raw(name: str, restored: bool, force: bool) -> None:
-    """Raise ImageError if the image was restored before, unless `force`: a second restoration
-    over-sharpens it.
+    """Raise ImageError if an image was restored before: a second restoration over-sharpens it.
+
+    Args:
+        name: the name of the image, for the message.
+        restored: True if the image was restored before.
+        force: True if the user wants to restore it all the same, so that no error is raised.
     """
     if restored and not force:
         raise ImageError(

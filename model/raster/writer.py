@@ -283,7 +283,7 @@ class ArrayPixels:
     pixels: np.ndarray
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
-        """Return rows `start` to `stop` (excluded) of one band, (rows, width)."""
+        """Return rows `start` to `stop` (excluded) of one band, counted from 0: (rows, width)."""
         return self.pixels[band, start:stop]
 
     def read_mask(self, start: int, stop: int) -> np.ndarray:
@@ -294,8 +294,12 @@ class ArrayPixels:
 
 
 def write_tiff(path: Path, dn: np.ndarray) -> None:
-    """Write an image (H, W) of one band as a losslessly compressed TIFF; after an error the file
-    does not exist.
+    """Write an image of one band as a losslessly compressed TIFF; after an error no partial file
+    remains.
+
+    Args:
+        path: the path of the TIFF.
+        dn: digital numbers (H, W) of an integer or float type.
     """
     height_px, width_px = dn.shape
     raster = Raster(1, height_px, width_px, dn.dtype)

@@ -91,8 +91,11 @@ def first_pass(sigma: float) -> PassSettings:
 
 
 def second_pass(sigma: float, quality: Quality) -> PassSettings:
-    """Return the published parameters of pass 2, in which the result of pass 1 is the guide, for
-    noise of standard deviation `sigma`.
+    """Return the published parameters of pass 2, in which the result of pass 1 is the guide.
+
+    Args:
+        sigma: the standard deviation of the noise.
+        quality: its `group_cap` limits the size of a group, which the published method does not.
     """
     similar = _below(sigma, {20: 15, 40: 25, 80: 30}, 45)
     excess = _below(sigma, {15: 1.1, 35: 1.0}, 0.9)
