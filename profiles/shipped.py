@@ -61,12 +61,16 @@ def target_names() -> list[str]:
 
 
 def board_names() -> list[str]:
-    """Return the names of the shipped boards with a DPU, whose files name the DPU's manual."""
+    """Return the names of the shipped boards with a DPU, AMD's INT8 accelerator; their files name
+    its manual.
+    """
     return _targets_with(r"^(base =|operators =)")
 
 
 def npu_names() -> list[str]:
-    """Return the names of the shipped targets with an NPU: it has rules and no cost model."""
+    """Return the names of the shipped targets with an NPU, AMD's successor of the DPU; they have
+    rules and no cost model.
+    """
     return _targets_with(r"^\[npu]")
 
 
