@@ -53,7 +53,7 @@ class Effort:
         step_px: only every `step_px`-th row is searched, because edges are longer than that.
         cell_px: the height and width of a cell in pixels, the height a multiple of `step_px`; only
             the steepest place of each cell is tried.
-        candidates: the number of steepest places whose squares are compared with plain edges.
+        candidates: the number of steepest places whose squares are checked for even sides.
         fits: the number of squares that are fitted, the steepest first.
     """
 

@@ -269,7 +269,8 @@ class Lpips(nn.Module):
     no upper bound.
 
     Name it with its network, "LPIPS-squeeze" (`label`), because figures of different networks
-    cannot be compared. `heads` are the weights of the channels of each compared layer, (C,) each.
+    cannot be compared. Its argument `heads` has the weights of the channels of each compared layer,
+    (C,) each; its attribute `heads` joins them.
     """
 
     heads: Tensor

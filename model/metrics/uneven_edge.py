@@ -104,17 +104,17 @@ class FittedEdge:
     Attributes:
         pixels: the pixels of the edge.
         line: the line of the edge.
-        levels: (6,) left and right plane: in the middle, change over half the length, change over
-            HALF_PX.
+        levels: (6,) the left plane, then the right one: pixel value in the middle of the edge,
+            change over half the edge's length along it, change over HALF_PX across it.
         weights: (P,) one over the standard deviation of each pixel near the edge, including texture
             and Huber's weight.
         step: difference of the planes at the edge.
         unevenness: root mean square of the residual texture of the planes, relative to the step.
-        normal: (P + 9, 9) weighted derivatives by planes and line, followed by their
-            regularisation.
-        curve: (P + 9, PARTS) derivatives by the weights of the curve.
-        rest: (P + 9,) the residual.
-        strip: (P,) number of the strip that each pixel lies in.
+        normal: (P + 9, 9) weighted derivatives of the P pixels by planes and line, followed by the
+            rows that regularise these 9 numbers.
+        curve: (P + 9, PARTS) weighted derivatives by the weights of the curve, followed by zeros.
+        rest: (P + 9,) the weighted residuals, followed by the right side of the regularisation.
+        strip: (P,) number of the strip along the edge that each pixel lies in.
     """
 
     pixels: EdgePixels
