@@ -16,12 +16,21 @@ ALONE = ""
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Load the arrays of a .npz file by name, or that of a .npy file, memory-mapped, as `ALONE`.
+    """Load the arrays of a .npz or .npy file.
 
     The content determines which of the two a file is, not its name.
 
+    Args:
+        path: the path of the file.
+
+    Returns:
+        A dictionary from the name of an array to the array. A .npy file has one array, under the
+        name `ALONE` (the empty text); it is memory-mapped, so that its pixels are read only when
+        they are used.
+
     Raises:
-        ValueError: a file that holds no arrays, or damaged ones; the message is the reason.
+        ValueError: the file cannot be read, holds no arrays, or holds damaged ones; the message is
+            the reason.
     """
     reason = unreadable(path)
     if reason is not None:

@@ -21,7 +21,7 @@ measured values. "assumed": chosen by this project. "stated": given by the user.
 
 
 def is_number(raw: object) -> bool:
-    """Return True if a value of a file is a finite number that float64 holds."""
+    """Return True if a value that was read from a file is a finite number that float64 can hold."""
     return (
         # Python counts True as an int. TOML allows integers of any size, which float64 cannot hold.
         isinstance(raw, int | float)
@@ -55,6 +55,11 @@ class Stated:
 
     A file states it as `{ value = ..., status = ..., source = ... }`. A bare value is the user's
     own statement: status "stated".
+
+    Attributes:
+        value: the value.
+        status: how the value was obtained, one of `Status`.
+        source: the document, measurement or reasoning that the value comes from; not empty.
     """
 
     value: Any
@@ -72,23 +77,26 @@ class Stated:
 
 @dataclass(frozen=True, config=CONFIG)
 class Constant(Stated):
-    """A value, or a range [low, high], with its provenance."""
+    """A number, or a range (low, high) of numbers, with its provenance.
+
+    A range in a sensor's file describes a family of sensors, from which single numbers are drawn.
+    """
 
     value: Number
 
     @property
     def low(self) -> float:
-        """The smallest value of the range."""
+        """The smallest value of the range; the number itself if there is no range."""
         return self.value[0] if isinstance(self.value, tuple) else self.value
 
     @property
     def high(self) -> float:
-        """The largest value of the range."""
+        """The largest value of the range; the number itself if there is no range."""
         return self.value[1] if isinstance(self.value, tuple) else self.value
 
     @property
     def middle(self) -> float:
-        """The middle of the range."""
+        """The mean of the two ends of the range; the number itself if there is no range."""
         return (self.low + self.high) / 2
 
     def __str__(self) -> str:
@@ -117,11 +125,12 @@ class Limits:
     type that pydantic checks.
 
     Attributes:
-        low: the smallest.
-        high: the largest.
-        whole: True if the number counts something.
-        single: True if other numbers depend on this one, so that it cannot be a range to draw from.
-        hint: a sentence that follows the one about a wrong number.
+        low: the smallest valid value.
+        high: the largest valid value.
+        whole: True if the constant must be an integer, because it counts something.
+        single: True if the constant must be one number and no range, because other numbers depend
+            on it.
+        hint: a sentence that ends the error message about an invalid number and says what to do.
     """
 
     low: float
@@ -131,11 +140,16 @@ class Limits:
     hint: str = "Correct it; the unit is in the name."
 
     def holds(self, value: float) -> bool:
-        """Return True if the constant can have the value."""
+        """Return True if one number is a valid value of the constant."""
         return self.low <= value <= self.high and not (self.whole and value % 1)
 
     def check(self, constant: Constant) -> Constant:
-        """Return the constant, or raise ValueError if it cannot have its value."""
+        """Return the constant unchanged if all its values are valid.
+
+        Raises:
+            ValueError: an end of the range is outside the limits or no integer, or the constant is
+                a range where one number is required.
+        """
         ends = dict.fromkeys((constant.low, constant.high))
         stated = " to ".join(f"{value:.12g}" for value in ends)
         if not all(map(self.holds, ends)):

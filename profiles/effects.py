@@ -23,11 +23,13 @@ factory rejects detectors further out.
 """
 
 Generator = Callable[[], np.random.Generator]
-"""Makes the generator of an effect that draws random numbers."""
+"""A function that returns the random generator of one effect."""
 
 
 class Digitiser(Protocol):
-    """The properties of an instrument that its effects use."""
+    """The two properties of an instrument that its effects need to convert radiance to pixel
+    values.
+    """
 
     @property
     def gain_dn_per_radiance(self) -> float:
@@ -35,29 +37,34 @@ class Digitiser(Protocol):
 
     @property
     def max_dn(self) -> int:
-        """The largest digital number."""
+        """The largest digital number that a pixel can have."""
 
 
 @dataclass(frozen=True)
 class Effect:
-    """Parameters, each a number within the limits that its annotation states.
+    """An imperfection of an instrument or of the atmosphere, with its parameters.
 
-    Effects are made for every drawn sensor, so they are plain dataclasses: the limits are checked
-    once, on the tables that they are drawn from.
+    A subclass is one effect, and each of its fields is a parameter: a number within the limits that
+    its annotation states. Effects are made for every drawn sensor, so they are plain dataclasses:
+    the limits are checked once, on the tables that they are drawn from.
     """
 
     cost: ClassVar[str] = "none: part of the MTF"
+    """The computing time that the effect takes, in words, for the plan that `simulate` prints."""
 
     @classmethod
     def limits(cls) -> dict[str, Limits]:
-        """Return the limits of each parameter."""
+        """Return the limits of each parameter, by its name."""
         hints = get_type_hints(cls, include_extras=True).items()
         return {name: hint.__metadata__[0] for name, hint in hints if hasattr(hint, "__metadata__")}
 
 
 @dataclass(frozen=True)
 class PixelEffect(Effect, ABC):
-    """An effect on the sampled image, in radiance (W/m2/sr/um) or in digital numbers (DN)."""
+    """An effect on the sampled image, in radiance (W/m2/sr/um) or in digital numbers (DN).
+
+    `acts_on` is the unit of the images that `apply` accepts and returns.
+    """
 
     acts_on: ClassVar[Literal["radiance", "DN"]]
     cost: ClassVar[str] = "1 pass"
@@ -68,24 +75,37 @@ class PixelEffect(Effect, ABC):
 
     @property
     def growth(self) -> float:
-        """The largest factor by which the effect enlarges a change of its input image."""
+        """The largest factor by which the effect enlarges a difference between two input images."""
         return 1.0
 
     @abstractmethod
     def apply(self, image: np.ndarray, sensor: Digitiser, generator: Generator) -> np.ndarray:
-        """Return an image (..., H, W) with the effect applied."""
+        """Return the image with the effect applied, in the same unit and shape.
+
+        Args:
+            image: (..., H, W) in the unit `acts_on`. Columns are detectors.
+            sensor: the gain and the full scale of the instrument.
+            generator: a function that returns the random generator of this effect. Only effects
+                that draw random numbers call it.
+        """
 
     @abstractmethod
     def bound_dn(self, sensor: Digitiser, low: float, high: float) -> float:
-        """Return the largest change of any pixel, in DN, for a signal between `low` and `high`
-        radiance.
+        """Return the largest change, in DN, that the effect can make to any pixel of a scene.
+
+        Args:
+            sensor: the gain and the full scale of the instrument.
+            low: the smallest radiance of the signal, in W/m2/sr/um.
+            high: the largest radiance of the signal, in W/m2/sr/um.
         """
 
 
 @dataclass(frozen=True)
 class AntiAlias(Effect):
-    """A Gaussian filter of standard deviation sigma_px target pixels, part of the MTF's budget; 0
-    is none.
+    """A Gaussian low-pass filter against aliasing, of standard deviation sigma_px pixels of the
+    sensor; 0 is no filter.
+
+    The filter is part of the blur that the sensor's MTF at Nyquist states, and does not add to it.
     """
 
     sigma_px: Annotated[float, Limits(0.0, 5.0)]
@@ -93,17 +113,23 @@ class AntiAlias(Effect):
 
 @dataclass(frozen=True)
 class Smear(Effect):
-    """Motion along the track during one exposure, in target pixels; 0 is none."""
+    """Blur by uniform motion along the track during one exposure, over length_px pixels of the
+    sensor; 0 is none.
+    """
 
     length_px: Annotated[float, Limits(0.0, 20.0)]
 
 
 @dataclass(frozen=True)
 class Haze(PixelEffect):
-    """Haze, table `veil`: transmittance of the atmosphere (1 is clear), path radiance in W/m2/sr/um
-    (0 is none).
+    """Light that the atmosphere absorbs and adds, table `veil` of a file: L' = transmittance * L +
+    path_radiance.
 
     It is the same before and after the blur, whose gain at frequency 0 is 1.
+
+    Attributes:
+        transmittance: share of the light that passes the atmosphere; 1 is clear.
+        path_radiance: radiance that the atmosphere adds, in W/m2/sr/um; 0 is none.
     """
 
     transmittance: Annotated[float, Limits(0.0, 1.0)]
@@ -120,12 +146,17 @@ class Haze(PixelEffect):
 
 @dataclass(frozen=True)
 class FullWell(PixelEffect):
-    """Radiance in W/m2/sr/um at which a detector is full, and the share of the excess that runs
-    along the column.
+    """Saturation of the detectors, and blooming: a share of the light beyond saturation runs along
+    the column.
 
     L' = min(L + share * (k * max(L - well, 0)), well). k spreads the excess up and down the column,
     falling by e every `blooming_px` pixels, and sums to 1 at most (what leaves the image is lost).
     Below the well nothing changes; share 0 is a plain clip.
+
+    Attributes:
+        radiance: the well, which is the radiance in W/m2/sr/um at which a detector is full.
+        blooming_share: the share of the excess that runs along the column.
+        blooming_px: the distance in pixels over which the excess falls by a factor e.
     """
 
     radiance: Annotated[float, Limits(1e-6, 1e6)]
@@ -153,8 +184,10 @@ class FullWell(PixelEffect):
 
 @dataclass(frozen=True)
 class Prnu(PixelEffect):
-    """Relative standard deviation of the detectors' responses, one detector per
-    column; 0 is none.
+    """Photo-response non-uniformity: each detector multiplies the light by a factor of its own, one
+    detector per column.
+
+    `rms` is the standard deviation of these factors, as a share of their mean; 0 is none.
     """
 
     rms: Annotated[float, Limits(0.0, 0.2)]
@@ -175,7 +208,10 @@ class Prnu(PixelEffect):
 
 @dataclass(frozen=True)
 class Dsnu(PixelEffect):
-    """Standard deviation of the detectors' offsets in DN, one detector per column; 0 is none."""
+    """Dark-signal non-uniformity: each detector adds an offset of its own, one detector per column.
+
+    `rms_dn` is the standard deviation of these offsets in DN; 0 is none.
+    """
 
     rms_dn: Annotated[float, Limits(0.0, 1e4)]
     acts_on = "DN"
@@ -209,7 +245,9 @@ class Striping(PixelEffect):
 
 @dataclass(frozen=True)
 class Offset(PixelEffect):
-    """Digital number of the dark; 0 is none."""
+    """A constant that is added to all pixels: offset_dn is the digital number of a pixel without
+    light; 0 is none.
+    """
 
     offset_dn: Annotated[float, Limits(0.0, 65535.0, single=True)]
     acts_on = "DN"
@@ -223,7 +261,9 @@ class Offset(PixelEffect):
 
 @dataclass(frozen=True)
 class Defects(PixelEffect):
-    """Dead pixels (always 0) and hot ones (always full scale), per million; 0 is none."""
+    """Faulty pixels: dead ones (always 0) and hot ones (always full scale), each per million
+    pixels; 0 is none.
+    """
 
     dead_per_million: Annotated[float, Limits(0.0, 1e6)]
     hot_per_million: Annotated[float, Limits(0.0, 1e6)]
@@ -261,11 +301,11 @@ TABLES: dict[str, type[Effect]] = {
 
 
 def pixel_effects(effects: Mapping[str, Effect], acts_on: str) -> dict[str, PixelEffect]:
-    """Return the effects on radiance or those on DN, in the order in which they apply.
+    """Return the effects that act on one unit, by name and in the order in which they apply.
 
     Args:
-        effects: all effects, by name.
-        acts_on: the unit that the effects must act on.
+        effects: all effects of an instrument, by the names in `TABLES`.
+        acts_on: "radiance" or "DN".
     """
     effects_in_order = ((name, effects.get(name)) for name in TABLES)
     return {
@@ -302,11 +342,15 @@ def _spread(excess: np.ndarray, length_px: float) -> np.ndarray:
 
 
 def effect_tables(label: str, raw: Mapping[str, object]) -> dict[str, object]:
-    """Return the tables of effects that a file has, with their keys checked.
+    """Return the tables of effects in the content of a file, by the names in `TABLES`, with their
+    keys checked.
 
     Args:
-        label: names the file in errors.
-        raw: its tables.
+        label: the name of the file, for error messages.
+        raw: the whole content of the file, by the names of its tables.
+
+    Raises:
+        ProfileError: a table has an unknown key, or lacks one.
     """
     tables = {name: raw[name] for name in TABLES if name in raw}
     for name, table in tables.items():
@@ -342,7 +386,12 @@ Effects = Annotated[Mapping[str, Table], PlainValidator(_read_effects)]
 
 
 def settled(tables: Mapping[str, Table], number: Callable[[Constant], float]) -> dict[str, Effect]:
-    """Return effects by name, every parameter settled by `number`."""
+    """Return effects by name, made from tables whose parameters may be ranges.
+
+    Args:
+        tables: the parameters of each effect, by the names in `TABLES`.
+        number: chooses one number of a range, such as its middle or a random draw.
+    """
     return {
         name: TABLES[name](**{key: number(constant) for key, constant in table.items()})
         for name, table in tables.items()

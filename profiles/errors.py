@@ -48,7 +48,9 @@ class BeersError(Exception):
 
 
 def printable(text: str, longest: int = LONGEST) -> str:
-    """Return text from a file as one printable line, cut to `longest` characters."""
+    """Return text from an untrusted file as one line that is safe to print, cut after `longest`
+    characters and then followed by "...".
+    """
     return one_line(text[:longest]) + ("..." if len(text) > longest else "")
 
 
@@ -60,7 +62,8 @@ def reason_of(error: BaseException) -> str:
 
 
 def one_line(text: str) -> str:
-    """Return the whole text on one line, with its escape for each character that is not printable.
+    """Return the whole text on one line, with Python's escape in place of each character that is
+    not printable.
 
     Among these are line breaks, control characters, and those that change the direction of writing:
     a name from a file must not look like another line of a log.
@@ -69,22 +72,27 @@ def one_line(text: str) -> str:
 
 
 def encodable(text: str) -> str:
-    """Return the text with escapes for what UTF-8 cannot encode, such as a file name in another
-    encoding.
+    """Return the text with a backslash escape for each character that UTF-8 cannot encode; file
+    names in another encoding have such characters.
     """
     return text.encode(errors="backslashreplace").decode()
 
 
 def visible(text: str) -> str:
-    """Return the text with every other unprintable character than a line break or a tab escaped."""
+    """Return the text with line breaks and tabs unchanged, and every other unprintable character
+    replaced by its Python escape.
+    """
     return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
 
 
 def sizes(*counts_bytes: float) -> list[str]:
-    """Format numbers of bytes, each in its own unit.
+    """Format numbers of bytes as text, each in its own unit: GB, MB, kB or bytes.
 
     All have the same number of significant digits, three or more, so that different numbers give
     different texts.
+
+    Returns:
+        One text for each number, in the same order.
     """
     for digits in range(3, 17):
         texts = [_size(count, digits) for count in counts_bytes]
@@ -118,11 +126,13 @@ class OptionError(BeersError, ValueError):
 
 
 class MachineError(BeersError, RuntimeError):
-    """This host lacks a resource: memory, disk space or workers."""
+    """The computer on which the command runs lacks a resource: memory, disk space or workers."""
 
 
 class MissingExtraError(MachineError, ImportError):
-    """An optional package is not installed. The message names the extra that installs it."""
+    """An optional package is not installed or does not load. The message names the extra that
+    installs it.
+    """
 
 
 CODE_FAULTS = (AttributeError, ImportError, NameError, TypeError)
@@ -150,8 +160,8 @@ def optional(package: str, where: str) -> Any:
     """Import an optional package and return its module.
 
     Args:
-        package: the name of the module to import.
-        where: the parameter or function that needs it.
+        package: the name of the module to import, whose first part is a key of `EXTRAS`.
+        where: the parameter or function of this library that needs the package, for the message.
 
     Raises:
         MissingExtraError: the package is not installed, or does not load.
@@ -163,7 +173,16 @@ def optional(package: str, where: str) -> Any:
 
 
 def missing_extra(error: ImportError, where: str) -> Exception:
-    """Return the error of an optional package that is missing or does not load, else `error`."""
+    """Return the error to raise in place of an ImportError.
+
+    Args:
+        error: the error that an import raised.
+        where: the parameter or function of this library that needed the import, for the message.
+
+    Returns:
+        A `MissingExtraError` that names the extra to install, if an optional package is missing or
+        does not load; otherwise `error` itself.
+    """
     package = _imported(error)
     return error if package is None else _without(package, where, error)
 

@@ -26,7 +26,16 @@ NOT_FINITE = "the result is not a finite number"
 
 @dataclass(frozen=True)
 class Figure:
-    """A finite number with its unit, mode and source, or no number and the reason why."""
+    """A reported number with its provenance, or no number and the reason why there is none.
+
+    Attributes:
+        value: the number, which is finite; None if the figure is unavailable.
+        unit: the unit of the number, such as "dB" or "ms".
+        mode: how the number was obtained, or "unavailable".
+        source: the measurement, the model or the document behind the number.
+        interval: the lower and the upper end of its uncertainty, in the same unit; None if unknown.
+        reason: why there is no number; empty if there is one.
+    """
 
     value: float | None
     unit: str
@@ -40,7 +49,9 @@ class Figure:
             raise ValueError(f"a figure that is not finite: {self.value} {self.interval or ''}")
 
     def to_json(self) -> dict[str, object]:
-        """Return the figure as a dictionary that matches the results schema."""
+        """Return the figure as a dictionary of plain values that matches the JSON schema of result
+        files.
+        """
         if self.mode == "unavailable":
             return {"value": None, "unit": self.unit, "mode": self.mode, "reason": self.reason}
         interval = list(self.interval) if self.interval else None
@@ -69,11 +80,11 @@ def measured(
     """Build a figure that this run measured on this machine.
 
     The figure is unavailable if `value` is NaN or infinite. It has no interval if an end of
-    `interval` is.
+    `interval` is NaN or infinite.
 
     Args:
-        value: the number.
-        unit: its unit.
+        value: the measured number.
+        unit: the unit of the number.
         source: how it was measured.
         interval: the range in which a repetition is expected, if known.
     """
@@ -91,10 +102,10 @@ def predicted(value: float, unit: str, interval: tuple[float, float], source: st
     It is unavailable if the value or an end of the interval is not finite.
 
     Args:
-        value: the number.
-        unit: its unit.
+        value: the predicted number.
+        unit: the unit of the number.
         interval: the range in which the true value is expected.
-        source: the model.
+        source: the name of the model that computed it.
     """
     if not all(math.isfinite(number) for number in (value, *interval)):
         return unavailable(unit, f"{NOT_FINITE} ({float(value)}): {source}")
@@ -102,12 +113,26 @@ def predicted(value: float, unit: str, interval: tuple[float, float], source: st
 
 
 def published(value: float, unit: str, source: str) -> Figure:
-    """Build a figure that a document prints."""
+    """Build a figure that a document prints.
+
+    Args:
+        value: the number as printed.
+        unit: the unit of the number.
+        source: the document.
+
+    Raises:
+        ValueError: the number is not finite.
+    """
     return Figure(float(value), unit, "published", source)
 
 
 def unavailable(unit: str, reason: str) -> Figure:
-    """Build a figure without a number, and with the reason why there is none."""
+    """Build a figure without a number.
+
+    Args:
+        unit: the unit that the number would have.
+        reason: why there is no number.
+    """
     return Figure(None, unit, "unavailable", reason=reason)
 
 
@@ -126,7 +151,14 @@ def number(value: float, digits: int) -> str:
 
 @dataclass(frozen=True)
 class Row:
-    """One row of a table: a name, its figures, and a text."""
+    """One row of a printed table.
+
+    Attributes:
+        table: the title of the table that the row belongs to.
+        name: the name of the row, such as a method or a board.
+        figures: the figures of the row, by the name of their column.
+        text: further columns that hold text, by the name of their column.
+    """
 
     table: str
     name: str
@@ -135,7 +167,9 @@ class Row:
 
 
 def by_table(rows: Iterable[Row]) -> dict[str, list[Row]]:
-    """Group rows by table, in the order in which the tables first appear."""
+    """Group rows by the title of their table: a dictionary in the order in which the tables first
+    appear.
+    """
     tables: dict[str, list[Row]] = {}
     for row in rows:
         tables.setdefault(row.table, []).append(row)
@@ -150,7 +184,8 @@ IN_THE_NAME = {"ratio", "node", "layer", "ReLU", "fault", "step", "opset", "size
 
 @dataclass(frozen=True)
 class Check:
-    """One check of a gate: a value and its limit.
+    """The comparison of one value with its limit, of which a gate (a test that may fail a build)
+    consists.
 
     NaN never passes.
 
@@ -160,7 +195,8 @@ class Check:
         limit: the largest value that passes, or the smallest if `bound` is "at least"; infinity for
             none.
         unit: the unit of both; a count has the name of the counted objects, for example "node".
-        bound: the side of the limit that passes.
+        bound: "at most" if values up to the limit pass, "at least" if values from the limit on
+            pass.
         detail: where the value was measured, or where the limit comes from; may be empty.
     """
 
@@ -173,26 +209,27 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """True if the value is within its limit."""
+        """True if the value is within its limit, which itself passes."""
         return self.value >= self.limit if self.bound == "at least" else self.value <= self.limit
 
     @property
     def actual(self) -> str:
-        """The value with its unit and detail, formatted for a person."""
+        """The value with its unit and detail, formatted for a person to read."""
         unit = "" if self.unit in IN_THE_NAME else f" {self.unit}"
         # A detail may hold the name of a node of another's file: it must stay on its line of a log.
         return f"{self.value:.4g}{unit}" + (f" ({printable(self.detail)})" if self.detail else "")
 
     @property
     def allowed(self) -> str:
-        """The limit, formatted for a person."""
+        """The limit, formatted for a person to read, such as "at most 2"."""
         return f"{self.bound} {self.limit:.4g}"
 
     def __str__(self) -> str:
         return f"{self.name} {self.actual}, allowed {self.allowed}"
 
     def to_json(self) -> dict[str, object]:
-        """Return the check as a dictionary that matches the results schema.
+        """Return the check as a dictionary of plain values that matches the JSON schema of result
+        files.
 
         A value or limit that is not finite becomes None, because JSON has no number for it.
         """

@@ -42,7 +42,8 @@ class Instrument:
         beta: variance in the dark, in (W/m2/sr/um)^2.
         gain_dn_per_radiance: digital numbers per W/m2/sr/um.
         bits: number of bits of a digital number.
-        effects: effects in addition to blur, noise and digitising, by name.
+        effects: effects in addition to blur, noise and digitising, by the name of their table in a
+            sensor's file, such as "smear".
         mtf_nyquist_along: contrast along the track; None if it equals the contrast across it. The
             detector line of a pushbroom lies across the track, so image rows are lines in time.
             "Across" is therefore the horizontal axis (along a row, fx) and "along" the vertical one
@@ -80,8 +81,11 @@ class Instrument:
 
     @property
     def symmetry(self) -> tuple[bool, bool]:
-        """Two flags: True if its images remain valid images of this sensor when (mirrored, rotated
-        by 90 degrees).
+        """Two flags: whether an image, mirrored or rotated by 90 degrees, could have been acquired
+        by the same sensor.
+
+        The first flag is for mirroring, the second for rotation. They tell which of the two may
+        augment training patches.
         """
         if isinstance(self.response, PointSpread):
             # A point-spread function may have no symmetry at all.
@@ -108,7 +112,7 @@ class Instrument:
 
     @property
     def offset_dn(self) -> float:
-        """The digital number without light; 0 without an offset."""
+        """The digital number of a pixel without light; 0 without an offset."""
         return float(getattr(self.effects.get(OFFSET), "offset_dn", 0))
 
     @property
@@ -124,8 +128,11 @@ class Instrument:
         return float(getattr(self.effects.get("smear"), "length_px", 0))
 
     def in_units_of(self, other: "Instrument") -> "Instrument":
-        """Return an instrument with this blur and noise, and with the gain, bits and offset of
-        `other`.
+        """Return an instrument with the blur and noise of this one, and with the gain, bits and
+        offset of `other`.
+
+        Pixels of the two can then be compared, because their digital numbers mean the same
+        radiance.
         """
         effects = with_offset_of(other.effects, self.effects)
         return replace(
@@ -133,13 +140,21 @@ class Instrument:
         )
 
     def noise_sigma(self, radiance: float) -> float:
-        """Return the standard deviation of the noise at `radiance`, both in W/m2/sr/um."""
+        """Return the standard deviation of the noise of a pixel of the given radiance, both in
+        W/m2/sr/um.
+        """
         # A sharp blur rings below zero, where the variance would be negative and have no root.
         return math.sqrt(max(self.alpha * radiance + self.beta, 0.0))
 
 
 def with_offset_of(others: Mapping[str, E], own: Mapping[str, E]) -> dict[str, E]:
-    """Return `own` effects with the offset of the other ones."""
+    """Return the effects of one instrument with the offset of another one in place of their own.
+
+    Args:
+        others: effects of the instrument whose offset is taken, by name; without an offset among
+            them the result has none.
+        own: effects from which everything but the offset is taken, by name.
+    """
     return {name: effect for name, effect in own.items() if name != OFFSET} | {
         name: effect for name, effect in others.items() if name == OFFSET
     }
@@ -149,8 +164,11 @@ def mtf_limit(antialias_sigma_px: float = 0.0) -> float:
     """Return the highest possible MTF at Nyquist: 2 / pi (a perfect lens over a square detector)
     times the gain of the anti-alias filter.
 
-    The gain of a Gaussian filter of sigma target pixels is exp(-2 pi^2 sigma^2 f^2) at f = 0.5
-    cycles per pixel.
+    The gain of a Gaussian filter is exp(-2 pi^2 sigma^2 f^2) at f = 0.5 cycles per pixel.
+
+    Args:
+        antialias_sigma_px: standard deviation of the filter in pixels of the sensor; 0 is no
+            filter.
     """
     return MTF_NYQUIST_MAX * math.exp(-2 * (math.pi * antialias_sigma_px * 0.5) ** 2)
 
@@ -160,8 +178,16 @@ def noise_from_snr(
 ) -> tuple[float, float]:
     """Solve sigma_i^2 = (L_i / SNR_i)^2 = alpha L_i + beta for (alpha, beta) (paper, section 3.3).
 
-    Either may come out negative: see `snr_0_bounds`. On a bound it is 0, whatever rounding left of
-    it.
+    Args:
+        radiance_0: the darker radiance L_0, in W/m2/sr/um.
+        snr_0: the SNR at `radiance_0`, as a linear ratio.
+        radiance_1: the brighter radiance L_1, in the same unit.
+        snr_1: the SNR at `radiance_1`, as a linear ratio.
+
+    Returns:
+        Alpha in W/m2/sr/um and beta in its square. Either is negative if no instrument can have the
+        two SNRs: see `snr_0_bounds`. On a bound it is exactly 0, because rounding errors are
+        removed.
     """
     variance_0 = (radiance_0 / snr_0) ** 2
     variance_1 = (radiance_1 / snr_1) ** 2
@@ -178,15 +204,16 @@ def _rounded_off(difference: float, rounding: float) -> float:
 
 
 def snr_0_bounds(radiance_0: float, radiance_1: float, snr_1: float) -> tuple[float, float]:
-    """Return the SNRs at `radiance_0` that a noise of variance alpha L + beta can have.
+    """Return the lowest and the highest SNR that an instrument can have at `radiance_0`, given its
+    SNR at a brighter point.
 
-    L is the radiance. At the lower bound alpha is 0, at the upper bound beta; between them both are
-    at least 0.
+    The variance of its noise is alpha L + beta, with L the radiance. At the lower bound alpha is 0,
+    at the upper bound beta is 0; between them both are positive.
 
     Args:
         radiance_0: the darker radiance, in W/m2/sr/um.
         radiance_1: the brighter radiance, in the same unit.
-        snr_1: the SNR at `radiance_1`.
+        snr_1: the SNR at `radiance_1`, as a linear ratio.
     """
     # Alpha >= 0 requires sigma_0 <= sigma_1, and beta >= 0 requires sigma_0^2 / L_0 >= sigma_1^2 /
     # L_1; sigma is L / SNR.

@@ -30,22 +30,27 @@ OFF_CENTRE_PX = 1.0
 
 @dataclass(frozen=True, config=CONFIG)
 class PointSpreadFile:
-    """The keys of [mtf] that state a point-spread function.
+    """The keys of the table [mtf] of a sensor's file that name a file with its point-spread
+    function.
 
     Attributes:
         psf: path of the .npy file, relative to the folder of the profile.
-        psf_samples_per_px: the number of samples per target pixel in each direction.
+        psf_samples_per_px: the number of samples per pixel of the sensor in each direction.
     """
 
     psf: str
     psf_samples_per_px: SamplesPerPx
 
     def read(self, label: str, folder: Path) -> PointSpread:
-        """Return the point-spread function, or raise ProfileError where the file holds none.
+        """Read the point-spread function, scale it to a sum of 1, and cut off its empty border.
 
         Args:
-            label: names the profile in errors.
-            folder: where the profile lies.
+            label: the name of the profile, for error messages.
+            folder: the folder of the profile, which must contain the .npy file.
+
+        Raises:
+            ProfileError: the path leads out of the folder, the file holds no array of real numbers,
+                or the samples are not those of a blur around the middle.
         """
         if not _lies_within(folder, self.psf):
             raise ProfileError(

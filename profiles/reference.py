@@ -13,8 +13,12 @@ logger = logging.getLogger(__name__)
 
 
 def require_same_units(degraded: Sensor, reference: Sensor) -> None:
-    """Raise ProfileError if the reference has another digitiser: its images would differ by a
-    factor.
+    """Raise ProfileError if two sensors have different gains, bits or offsets: their images would
+    differ by a factor.
+
+    Args:
+        degraded: the sensor whose images are restored.
+        reference: the better sensor that the restoration aims at.
     """
     if degraded.units != reference.units:
         raise ProfileError(
@@ -25,7 +29,7 @@ def require_same_units(degraded: Sensor, reference: Sensor) -> None:
 
 
 def describe_units(profile: Sensor) -> str:
-    """Return a sentence on the meaning of a digital number of the profile."""
+    """Return a phrase on the meaning of a digital number of a sensor: its gain, bits and offset."""
     gain, bits, offset_dn = profile.units
     return f"{gain:g} DN per W/m2/sr/um, {bits:g} bits" + (
         f", {offset_dn:g} DN of offset" if offset_dn else ""
@@ -33,8 +37,16 @@ def describe_units(profile: Sensor) -> str:
 
 
 def reference_beside(degraded: Sensor, named: Sensor | str | os.PathLike[str] | None) -> Sensor:
-    """Return the reference profile that a user names, or the default one, in the digital numbers of
-    `degraded`; log if one that is named states other numbers.
+    """Load the reference, the better sensor that a restoration aims at, and convert it to the
+    digital numbers of the degraded sensor.
+
+    Args:
+        degraded: the sensor whose images are restored.
+        named: the reference that the user names; None for the shipped one. If its gain, bits or
+            offset are others, the conversion is logged.
+
+    Raises:
+        ProfileError: `named` is not a valid profile.
     """
     profile = Sensor.load(named or REFERENCE)
     reference = profile.in_units_of(degraded)

@@ -81,10 +81,10 @@ Side = Annotated[int, Field(strict=True, ge=1, le=KEPT_SIDE)]
 @with_config(CONFIG)
 @dataclass(frozen=True)
 class MtfTable:
-    """Contrast at some frequencies, measured on each axis.
+    """The blur of an instrument as contrasts at some frequencies, measured on each axis.
 
     Attributes:
-        frequency: ascending from 0 to at least 0.5 and below 1, in cycles per target pixel.
+        frequency: ascending from 0 to at least 0.5 and below 1, in cycles per pixel of the sensor.
         across: contrast across the track at each frequency: 1 at frequency 0 and above 0
             everywhere.
         along: the same along the track.
@@ -174,12 +174,13 @@ class MtfTable:
 @with_config(CONFIG)
 @dataclass(frozen=True)
 class PointSpread:
-    """The image of a point: (height, width) samples, along the track and across it.
+    """The blur of an instrument as the image of a point: (height, width) samples, along the track
+    and across it.
 
     Attributes:
         height: the number of rows.
         width: the number of columns.
-        samples_per_px: the number of samples per target pixel in each direction; 2 or more.
+        samples_per_px: the number of samples per pixel of the sensor in each direction; 2 or more.
         samples: their values as text (see `packed`), which is hashable and can be stored in JSON.
     """
 
@@ -235,13 +236,19 @@ Response = MtfTable | PointSpread
 
 
 def packed(values: NDArray[np.floating]) -> str:
-    """Return samples of any shape as text: float32, compressed, in base 64."""
+    """Encode samples of any shape as text, for `PointSpread.samples`: float32, compressed, in base
+    64.
+    """
     content = np.ascontiguousarray(values, "<f4").tobytes()
     return base64.b64encode(zlib.compress(content, 9)).decode()
 
 
 def unpacked(point: PointSpread) -> NDArray[np.float64]:
-    """Return the samples, (height, width)."""
+    """Decode the samples of a point-spread function, (height, width).
+
+    Raises:
+        ValueError: the text does not hold this number of samples.
+    """
     count_bytes = 4 * point.height * point.width
     try:
         compressed = base64.b64decode(point.samples, validate=True)
@@ -253,7 +260,8 @@ def unpacked(point: PointSpread) -> NDArray[np.float64]:
 
 
 def centroid(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the row and column of the centroid of samples (H, W), relative to the middle.
+    """Return the row and column of the centroid of samples (H, W), in samples and relative to the
+    middle.
 
     The sum of the samples must not be 0.
     """

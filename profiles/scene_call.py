@@ -19,9 +19,17 @@ from beers_deploy.profiles.validation import CONFIG, check_keys, validated
 
 @dataclass(frozen=True, config=CONFIG)
 class SceneCall:
-    """The content of one TOML file under `profiles/scenes/`.
+    """A kind of scene, such as a port at night: what it demands of the simulation of a sensor.
 
-    `radiance_scale` multiplies the radiance of the scene, because photographs show a clear day.
+    It is the content of one TOML file under `profiles/scenes/`.
+
+    Attributes:
+        name: the name of the file, without its suffix.
+        description: one sentence for the user.
+        radiance_scale: the factor on the radiance of the scene; 1 is the clear day that photographs
+            show.
+        effects: the effects that the scene adds to a sensor, by name.
+        without: the names of effects that the scene removes from a sensor.
     """
 
     name: str
@@ -45,7 +53,11 @@ class SceneCall:
 
     @classmethod
     def load(cls, name: str) -> "SceneCall":
-        """Read a shipped scene by name, or the user's own by the path of its .toml file."""
+        """Read a shipped scene by its name, or a user's scene by the path of its .toml file.
+
+        Raises:
+            ProfileError: unknown name, or a file with wrong, missing or contradictory keys.
+        """
         label, raw = read_toml("scenes", name)
         check_keys(label, raw, ("description", "radiance_scale"), ("without", *TABLES))
         fields = {key: value for key, value in raw.items() if key not in TABLES}
@@ -55,8 +67,12 @@ class SceneCall:
 
 
 def typical_effects() -> dict[str, Table]:
-    """Return typical values of every optional effect (`profiles/effects.toml`), which `--with NAME`
-    adds.
+    """Read the typical values of every optional effect from `profiles/effects.toml`.
+
+    `simulate --with NAME` adds an effect with these values.
+
+    Returns:
+        The parameters of each effect, by the name of the effect.
     """
     label, raw = read_toml("", str(HERE / "effects.toml"))
     return dict(validated(AnyEffects, raw, label))
@@ -69,18 +85,19 @@ def calling_for(
     forbid: Collection[str] = (),
 ) -> Sensor:
     """Return the profile with the effects of a scene and those in `add`, and without those in
-    `forbid`.
+    `forbid` and those that the scene removes.
 
     Values that the profile or the scene states take precedence over typical ones.
 
     Args:
         profile: the sensor.
-        scene: the scene, if any; it may add effects and forbid others.
+        scene: the scene, if any; it may add effects and remove others.
         add: names of effects to add with typical values.
         forbid: names of effects to remove.
 
     Raises:
         OptionError: if a name is not that of an effect.
+        ProfileError: if the resulting profile is contradictory.
     """
     for name in (*add, *forbid):
         if name not in TABLES:
@@ -103,9 +120,16 @@ def origins(
     add: Collection[str] = (),
     forbid: Collection[str] = (),
 ) -> dict[str, str]:
-    """Return, by name of the effect, where each effect of `calling_for`'s profile comes from.
+    """State where each effect of a simulation comes from, for its printed plan.
 
-    An effect that was removed is listed with the sensor, scene or option that removed it.
+    Args:
+        profile: the sensor before `calling_for` was applied to it.
+        scene: the scene, if any.
+        add: names of effects that the user adds.
+        forbid: names of effects that the user removes.
+
+    Returns:
+        From the name of an effect to the sensor, scene or option that added it, or that removed it.
     """
     # Stated effects take precedence over added ones.
     sources = dict.fromkeys(add, "`with_`")

@@ -58,10 +58,14 @@ def _dark(fields: dict[str, Constant]) -> Constant:
 
 @dataclass(frozen=True, repr=False, config=CONFIG)
 class Sensor:
-    """The content of one TOML file under `profiles/sensors/`, each constant with its source.
+    """A sensor profile: the content of one TOML file under `profiles/sensors/`, each number with
+    its source. Ranges describe a family of sensors.
 
-    The noise is stated by two SNRs, at `radiance_0` and `radiance_1`, or by `alpha` and `beta`. The
-    blur is that of `response`, a table or a point-spread function, if there is one.
+    `gsd_m` is the side of a pixel on the ground in m, and that of `oversampling` scene pixels.
+    `mtf_nyquist` is the contrast at 0.5 cycles per pixel; `mtf_nyquist_along` is that along the
+    track, if it differs. `response` is the complete blur, if known. Two SNRs, at `radiance_0` and
+    `radiance_1` in W/m2/sr/um, state the noise, or `alpha` and `beta` do: its variance is alpha L +
+    beta.
 
     Examples:
         >>> sensor = bd.Sensor.load("pleiades-degraded").replace(mtf_nyquist=0.05)
@@ -207,7 +211,7 @@ class Sensor:
         """Return this sensor with some numbers replaced, each by a value or a range (low, high).
 
         Args:
-            numbers: by the names of the file's keys, such as mtf_nyquist=0.1 or snr_1=(90, 110).
+            numbers: new values by the file's keys, such as mtf_nyquist=0.1 or snr_1=(90, 110).
 
         Raises:
             ProfileError: no such number, or one that no instrument can have.
@@ -231,7 +235,7 @@ class Sensor:
         return self.with_fields(**{**fields, **numbers})
 
     def with_fields(self, **fields: object) -> "Sensor":
-        """Return this sensor with other fields, checked like those of a file."""
+        """Return this sensor with other fields, or raise ProfileError if they are invalid."""
         return validated(Sensor, {**vars(self), **fields}, f"sensor {self.name}", GROUPS)
 
     @property
@@ -256,7 +260,7 @@ class Sensor:
         return radiance * gain + offset_dn
 
     def noise(self, radiance: ArrayLike) -> NDArray[np.float64]:
-        """Return the noise's standard deviation at radiances, in the middle of each range."""
+        """Return the standard deviation of the noise at radiances, each range at its middle."""
         alpha, beta = self._middle_noise()
         return np.sqrt(np.maximum(alpha * np.asarray(radiance, np.float64) + beta, 0.0))
 
@@ -280,8 +284,7 @@ class Sensor:
         return self.gain_dn_per_radiance.low, self.bits.low, offset
 
     def in_units_of(self, other: "Sensor") -> "Sensor":
-        """Return this profile with the gain, bits and offset of `other`, or itself if they are
-        equal.
+        """Return this profile with the gain, bits and offset of `other`; itself if they are equal.
 
         Two acquisitions of one scene can be compared pixel by pixel only if their digital numbers
         mean the same.
@@ -294,15 +297,11 @@ class Sensor:
         )
 
     def draw(self, generator: np.random.Generator) -> Instrument:
-        """Pick one sensor from the ranges: MTF uniform, SNR pair uniform over the physically valid
-        pairs.
-        """
+        """Draw one instrument: MTF uniform, SNR pair uniform over the physically valid pairs."""
         return self.draw_counted(generator)[0]
 
     def draw_counted(self, generator: np.random.Generator) -> tuple[Instrument, int]:
-        """Draw an instrument as `draw` does, and also return the number of rejected, impossible SNR
-        pairs.
-        """
+        """Draw as `draw` does, and also count the SNR pairs rejected as impossible."""
 
         def number(constant: Constant) -> float:
             return float(generator.uniform(constant.low, constant.high))
@@ -355,7 +354,7 @@ class Sensor:
 
     @property
     def snr_pair(self) -> tuple[Constant, Constant]:
-        """The SNRs at `radiance_0` and `radiance_1`.
+        """The SNRs at `radiance_0` and `radiance_1`, as linear ratios.
 
         Raises:
             ValueError: the noise is stated by alpha and beta.

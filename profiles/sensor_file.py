@@ -58,7 +58,9 @@ RESPONSE = ("frequency", "across", "along", "psf", "psf_samples_per_px")
 
 
 def table_keys(table: str) -> tuple[str, ...]:
-    """Return every key that a table may have, each once, in the order of its ways."""
+    """Return every key that a table of a sensor's file may have, each once: of all the alternative
+    ways to fill it.
+    """
     keys: dict[str, None] = {}
     for required, optional in TABLES[table]:
         keys |= dict.fromkeys(required + optional)
@@ -66,7 +68,9 @@ def table_keys(table: str) -> tuple[str, ...]:
 
 
 def constant_keys(table: str) -> tuple[str, ...]:
-    """Return the keys of a table that are constants, and fields of `Sensor`."""
+    """Return the keys of a table of a sensor's file that state numbers, each of which is a field of
+    `Sensor`.
+    """
     return tuple(key for key in table_keys(table) if key not in RESPONSE)
 
 
@@ -80,12 +84,17 @@ GROUPS = {key: f"{table}.{key}" for key, table in TABLE_OF.items()} | {"effects"
 
 
 def sensor_fields(label: str, raw: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the fields of a `Sensor` that the tables of its file state.
+    """Return the fields of a `Sensor`, by name, that the tables of its file state. They are not
+    validated yet.
 
     Args:
-        label: names the file in errors.
-        raw: its tables.
-        folder: where it lies, from which the path of a point-spread function counts.
+        label: the name of the file, for error messages.
+        raw: the parsed content of the file, by the names of its tables.
+        folder: the folder of the file, to which the path of a point-spread function is relative.
+
+    Raises:
+        ProfileError: a table or key is unknown, missing or contradicts another, or the blur is
+            invalid.
     """
     check_keys(label, raw, {"description", *TABLES}, EFFECT_TABLES)
     fields: dict[str, Any] = {
@@ -137,15 +146,28 @@ def _blur(label: str, raw: Mapping[str, object], folder: Path) -> dict[str, Any]
 
 
 def axes_of(response: Response, status: Status, source: str) -> dict[str, Constant | None]:
-    """Return the contrasts at Nyquist as constants of a profile. That along the track is None if it
-    equals that across it.
+    """Return the two fields of a `Sensor` that state the contrast at Nyquist, computed from a
+    complete blur.
+
+    The contrast along the track is None if it equals that across it.
+
+    Args:
+        response: the table or the point-spread function.
+        status: the status of the contrasts, which is that of the response.
+        source: the source of the response.
     """
     across, along = (Constant(value, status, source) for value in response.at_nyquist)
     return {"mtf_nyquist": across, "mtf_nyquist_along": along if along != across else None}
 
 
 def sensor_toml(description: str, tables: Mapping[str, Mapping[str, object]]) -> str:
-    """Return the text of a sensor's TOML file. Values of its tables may be plain or `Stated`."""
+    """Return the text of a sensor's TOML file.
+
+    Args:
+        description: one sentence for the user.
+        tables: the content of the file: by the name of a table and by key, values that are plain or
+            `Stated`.
+    """
     lines = [f"description = {_toml(description)}"]
     for name, table in tables.items():
         lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in table.items())]

@@ -6,12 +6,19 @@ from beers_deploy.profiles.sensor_file import TABLE_OF
 
 
 def same_instrument(one: Sensor, other: Sensor) -> bool:
-    """Return True if two profiles have the same numbers, whatever their names and sources."""
+    """Return True if two profiles state the same numbers, and so produce the same images; names and
+    sources may differ.
+    """
     return numbers_of(one) == numbers_of(other)
 
 
 def numbers_of(profile: Sensor) -> dict[str, object]:
-    """Return the low and high end of each constant, by name."""
+    """Return the numbers of a profile in a form that can be compared.
+
+    Returns:
+        From the name of each constant to its (low, high) ends, or None if the profile lacks it; the
+        key "response" has the complete blur as text.
+    """
     constants: dict[str, Constant | None] = {key: getattr(profile, key) for key in TABLE_OF}
     for effect, table in profile.effects.items():
         constants |= {f"{effect}.{key}": constant for key, constant in table.items()}

@@ -28,12 +28,20 @@ TILE_PX = 640
 
 
 def shipped_names(kind: str) -> list[str]:
-    """Return the names of the profiles shipped in `profiles/KIND/`."""
+    """Return the sorted names of the profiles shipped in `profiles/KIND/`: "sensors", "scenes" or
+    "targets".
+    """
     return sorted(path.stem for path in (HERE / kind).glob("*.toml"))
 
 
 def profile_path(kind: str, name: str) -> Path:
-    """Return the path of a profile: in `profiles/KIND/`, or the user's own path."""
+    """Return the path of a profile's TOML file; it need not exist.
+
+    Args:
+        kind: the folder of shipped profiles: "sensors", "scenes" or "targets".
+        name: the name of a shipped profile, or the path of the user's own file, which ends in
+            .toml.
+    """
     return Path(name) if name.endswith(".toml") else HERE / kind / f"{name}.toml"
 
 
@@ -48,17 +56,21 @@ def scene_names() -> list[str]:
 
 
 def target_names() -> list[str]:
-    """Return the names of the shipped targets."""
+    """Return the names of the shipped targets, the processing boards."""
     return shipped_names("targets")
 
 
 def board_names() -> list[str]:
-    """Return the names of the shipped boards with a DPU, whose files name the DPU's manual."""
+    """Return the names of the shipped boards with a DPU, AMD's INT8 accelerator; their files name
+    its manual.
+    """
     return _targets_with(r"^(base =|operators =)")
 
 
 def npu_names() -> list[str]:
-    """Return the names of the shipped targets with an NPU: it has rules and no cost model."""
+    """Return the names of the shipped targets with an NPU, AMD's successor of the DPU; they have
+    rules and no cost model.
+    """
     return _targets_with(r"^\[npu]")
 
 

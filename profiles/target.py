@@ -46,13 +46,22 @@ def _activations(words: Words) -> Words:
 
 @dataclass(frozen=True, repr=False, config=CONFIG)
 class TargetProfile:
-    """The content of one TOML file under `profiles/targets/`, its base included.
+    """The description of one processing board: the content of a TOML file under
+    `profiles/targets/`, with the keys of its base that the file does not state itself.
 
-    `tables` maps a topic ("array", "memory", "conv", "power", ...) to its constants.
-    `configurations` maps the name of a build of the accelerator to its constants, and is empty if
-    there is only one build. `activations` states which activations are fused with which operation,
-    and `documents` names the manuals; both are empty for a board without a DPU. `npu` states which
-    operators an NPU supports, and is empty for every other board.
+    Attributes:
+        name: the name of the file, without its suffix.
+        description: one sentence for the user.
+        tables: from a topic ("array", "memory", "conv", "power", ...) to its constants by key.
+        default_configuration: the configuration that is used if none is named; None if there is
+            only one build.
+        configurations: from the name of a build of the accelerator to its constants; empty if there
+            is only one build.
+        activations: from an operation to the activation functions that the accelerator computes
+            together with it; empty for a board without a DPU.
+        documents: the manuals that state the rules, by their subject; empty for a board without a
+            DPU.
+        npu: which operators an NPU supports; empty for every other board.
     """
 
     name: str
@@ -95,12 +104,26 @@ class TargetProfile:
         return f"{type(self).__name__}({self.name!r}{builds})"
 
     def value(self, table: str, key: str) -> float:
-        """Return the value of a constant; it must not be a range."""
+        """Return the value of a constant that is a single number.
+
+        Args:
+            table: the topic, a key of `tables`.
+            key: the name of the constant.
+
+        Raises:
+            ProfileError: the profile lacks the constant.
+        """
         return self.constant(table, key).low
 
     def constant(self, table: str, key: str) -> Constant:
-        """Return a constant with its range and source, or raise ProfileError if the profile lacks
-        it.
+        """Return a constant with its range and source.
+
+        Args:
+            table: the topic, a key of `tables`.
+            key: the name of the constant.
+
+        Raises:
+            ProfileError: the profile lacks the constant.
         """
         try:
             return self.tables[table][key]
@@ -115,7 +138,14 @@ class TargetProfile:
             ) from None
 
     def configuration(self, name: str | None = None) -> tuple[str, dict[str, Constant]]:
-        """Name and constants of configuration `name`, or of the default one."""
+        """Return the name and the constants of one build of the accelerator.
+
+        Args:
+            name: the name of the build; None for the default one.
+
+        Raises:
+            ProfileError: the board has no such build, or no default one.
+        """
         build = name or self.default_configuration
         if build is None or build not in self.configurations:
             missing = "default configuration" if build is None else f"configuration {build!r}"
@@ -177,7 +207,7 @@ def _joined(above: Mapping[str, Any], below: Mapping[str, Any]) -> dict[str, Any
 
 
 def require_side(tile_px: int) -> int:
-    """Return the side of a tile, or raise OptionError if it is below 1 px."""
+    """Return the side of a tile in pixels unchanged, or raise OptionError if it is below 1."""
     if tile_px < 1:
         raise OptionError(f"`tile` must be at least 1 px, got {tile_px} px. Choose another.")
     return tile_px

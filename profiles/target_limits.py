@@ -70,16 +70,17 @@ ANY_KEY = frozenset(
 
 
 def check_limits(place: str, table: Mapping[str, Constant]) -> None:
-    """Raise ValueError if a number is outside its limits.
+    """Raise ValueError if a number in a board's file is outside its limits, such as a negative
+    clock.
 
-    A key without limits is used by no rule and no prediction.
+    A key without limits is accepted, because no rule and no prediction uses it.
 
     Args:
-        place: the dotted name of the table.
-        table: its constants.
+        place: the dotted name of the table, such as "configurations.C32B3".
+        table: the constants of the table, by key.
 
     Raises:
-        ValueError: the dotted key, its limits and its number.
+        ValueError: names the dotted key, its limits and its number.
     """
     for key, constant in table.items():
         limits = LIMITS.get(key, OPEN if place in ANY_KEY else None)

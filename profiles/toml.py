@@ -22,9 +22,14 @@ QUOTED = 80
 
 
 def read_toml_text(path: Path) -> dict[str, object]:
-    """Read a TOML file as plain values, or raise ValueError with the reason.
+    """Read a TOML file as plain values of Python.
 
     The values may include inf, nan and integers of any size.
+
+    Raises:
+        ValueError: the file is too large or no valid TOML; the message is the reason, with the
+            line.
+        OSError: the file cannot be opened.
     """
     # Some editors on Windows begin a file with a byte order mark.
     text = read_whole(path, TOML_BYTES).decode("utf-8-sig")
@@ -53,12 +58,22 @@ def _line_at_fault(text: str, reason: str) -> str:
 
 
 def read_json(path: Path) -> object:
-    """Read a JSON file as plain values of Python."""
+    """Read a JSON file as plain values of Python.
+
+    Raises:
+        ValueError: the file is too large or no valid JSON; the message is the reason.
+        OSError: the file cannot be opened.
+    """
     return parse_json(read_whole(path, JSON_BYTES).decode("utf-8-sig"))
 
 
 def parse_json(text: str) -> object:
-    """Read JSON text as plain values of Python; raise ValueError with the reason if it is none."""
+    """Parse JSON text from an untrusted source into plain values of Python.
+
+    Raises:
+        ValueError: the text is empty or no valid JSON, has a key twice, or a number that float64
+            cannot hold; the message is the reason.
+    """
     if not text.strip():
         raise ValueError("it is an empty file")
     try:
@@ -101,7 +116,12 @@ def _whole(text: str) -> int:
 
 
 def read_whole(path: Path, limit_bytes: int) -> bytes:
-    """Read all bytes of a regular file that has at most `limit_bytes`."""
+    """Read all bytes of a file that is not larger than expected.
+
+    Raises:
+        ValueError: the path is no regular file, a Git LFS pointer, or larger than `limit_bytes`.
+        OSError: the file does not exist or cannot be opened.
+    """
     status = path.stat()
     if reason := unreadable(path):
         raise ValueError(reason)
@@ -111,10 +131,11 @@ def read_whole(path: Path, limit_bytes: int) -> bytes:
 
 
 def unreadable(path: Path) -> str | None:
-    """Return the reason why a path cannot be read as a file, or None if it can.
+    """Return the reason why a path cannot be read as a file, as a phrase for a message, or None if
+    it can be read.
 
     Git LFS stores a pointer in place of each large file that was not fetched: 130 bytes of text
-    under its name.
+    under the name of the file.
     """
     try:
         mode = path.stat().st_mode
@@ -132,7 +153,18 @@ def unreadable(path: Path) -> str | None:
 
 
 def read_toml(kind: str, name: str) -> tuple[str, dict[str, object]]:
-    """Return (label for messages, parsed table) of profile `name`."""
+    """Read the TOML file of a profile.
+
+    Args:
+        kind: the folder of shipped profiles: "sensors", "scenes" or "targets".
+        name: the name of a shipped profile, or the path of the user's own .toml file.
+
+    Returns:
+        The file's name, as a label for messages, and its content.
+
+    Raises:
+        ProfileError: no such profile, or a file that cannot be read as TOML.
+    """
     path = profile_path(kind, name)
     names = shipped_names(kind)
     if not name.endswith(".toml") and name not in names:

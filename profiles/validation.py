@@ -36,17 +36,18 @@ EXAMPLES = {
 
 
 def validated(kind: type[T], raw: object, label: str, groups: Mapping[str, str] | None = None) -> T:
-    """Convert plain values to a type, or raise ProfileError.
+    """Convert plain values to a type of this project, or raise ProfileError with one sentence.
 
     Args:
         kind: any type that pydantic can check.
         raw: plain values, as TOML and JSON hold them.
-        label: names the file in messages.
-        groups: the dotted key of a field of the type, if it differs from its name; "" for a field
-            that only groups tables of the file.
+        label: the name of the file, for messages.
+        groups: from the name of a field of the type to its dotted key in the file, where they
+            differ; to "" for a field that only groups tables of the file.
 
     Raises:
-        ProfileError: the file, the dotted key, the error in its value and what to do.
+        ProfileError: a value is missing, unknown or invalid; the message has the file, the dotted
+            key, the error in its value and what to do.
     """
     try:
         return TypeAdapter(kind).validate_python(raw)
@@ -97,10 +98,11 @@ def check_keys(
     It is for tables whose keys depend on more than a type.
 
     Args:
-        where: names the file and the table in messages.
-        raw: the table.
-        required: the keys that it must have; as a mapping also the values that each can have.
-        optional: keys that it may have.
+        where: the names of the file and the table, for messages.
+        raw: the table to check.
+        required: the keys that the table must have. It may be a mapping from each key to the values
+            that the key accepts, which the message then states.
+        optional: further keys that the table may have.
     """
     allowed = sorted({*required, *optional})
     for key in raw:

@@ -18,13 +18,13 @@ def site_interval(
     """Compute the 95 % percentile interval of the mean of `values` by drawing whole sites with
     replacement.
 
-    Images of one site resemble one another. Drawing single images would make the interval too
-    narrow.
+    A site is the place that an image shows. Images of one site resemble one another, so that
+    drawing single images would make the interval too narrow.
 
     Args:
         values: (N,) one figure per image.
-        sites: (N,) the site of each image.
-        generator: for the draws.
+        sites: (N,) the name of the site of each image.
+        generator: the random generator for the draws.
 
     Returns:
         The interval and its description; or None and the reason, if there are fewer than five
@@ -47,13 +47,17 @@ def site_interval(
 
 
 def percentiles(draws: np.ndarray) -> tuple[float, float]:
-    """Compute the 95 % interval of a figure from percentiles of its draws (N,)."""
+    """Return the two ends of the 95 % interval of a figure, computed from N bootstrap draws of it,
+    (N,).
+    """
     low, high = np.percentile(draws, [50 * (1 - LEVEL), 50 * (1 + LEVEL)])
     return float(low), float(high)
 
 
 def too_few(sites: int) -> str:
-    """Return a sentence if there are too few sites for an interval, else an empty string."""
+    """Return a sentence that explains why no interval over `sites` sites is shown, or an empty
+    string if there are enough sites.
+    """
     if sites >= LEAST_SITES:
         return ""
     return (

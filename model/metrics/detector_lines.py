@@ -27,15 +27,16 @@ a border are not evaluated.
 
 
 class Blocks(NamedTuple):
-    """Lines measured in blocks along them; every array is (blocks, lines), NaN where nothing could
-    be measured.
+    """Lines of detectors (columns or rows), each measured in several blocks along it.
+
+    Every array is (blocks, lines), NaN where nothing could be measured.
 
     Attributes:
         second: each line less the mean of its two neighbours, in pixel values.
-        error: its standard error by the scatter within the block.
-        level: pixel value around the line.
-        constant: True where all pixels of a line in the block have one value, and those around it
-            do not.
+        error: the standard error of `second`, from the scatter within the block.
+        level: the median pixel value of the lines around.
+        constant: bool, True where all pixels of a line in the block have one value, and those of
+            the neighbours do not.
     """
 
     second: np.ndarray
@@ -44,7 +45,7 @@ class Blocks(NamedTuple):
     constant: np.ndarray
 
     def of(self, lines: slice) -> "Blocks":
-        """Return the measurements of the lines in a slice."""
+        """Return the measurements of a range of lines, with all their blocks."""
         return Blocks(*(array[:, lines] for array in self))
 
 

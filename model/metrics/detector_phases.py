@@ -30,14 +30,15 @@ COLOUR = 0.05
 
 @dataclass(frozen=True)
 class Pattern:
-    """One pattern of period 2.
+    """The strength of one fixed pattern with a period of two pixels in an image.
 
     Attributes:
         name: one of `PATTERNS`.
-        difference: between its two kinds of pixels over the level, root mean square of the sections
-            without noise.
-        largest: the largest significant one of the sections.
-        significant: whether enough sections show it significantly.
+        difference: difference between the two kinds of pixels, as a share of their mean value: the
+            root mean square over the sections of the image, without noise.
+        largest: the largest difference of a section in which it is significant; 0 if there is none.
+        significant: True if `difference` exceeds the smallest relevant one, and enough sections
+            show the pattern significantly.
     """
 
     name: str
@@ -47,16 +48,16 @@ class Pattern:
 
 
 def measure_phases(pixels: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Measure the patterns of one section.
+    """Measure the fixed patterns with a period of two pixels in one section of an image.
 
     Args:
-        pixels: (h, w) float32, whose first row and column are even ones of the image.
-        valid: where they are measurements.
+        pixels: (h, w) float32. The first row and column have even numbers in the image.
+        valid: (h, w) bool, True for measured pixels: neither missing nor at an end of full scale.
 
     Returns:
-        The differences over the level, (3,), in the order of `PATTERNS`, and their standard errors;
-            NaN where the
-        section is too small or dark.
+        The differences between the two kinds of pixels as shares of their mean value, (3,), in the
+        order of `PATTERNS`; and their standard errors, (3,). NaN if the section is too small or
+        dark.
     """
     nothing = np.full(3, np.nan), np.full(3, np.nan)
     if min(pixels.shape) < 8 * EDGE_PX:
@@ -87,11 +88,14 @@ def measure_phases(pixels: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, n
 def judge_phases(
     measured: Sequence[tuple[np.ndarray, np.ndarray]], least: float
 ) -> tuple[Pattern, ...]:
-    """Evaluate the measurements of an image's sections for each pattern.
+    """Decide from all sections of an image which fixed patterns it has.
 
     Args:
         measured: the measurement of each section, as `measure_phases` returns it.
-        least: the smallest relevant difference, over the level.
+        least: the smallest relevant difference, as a share of the mean value.
+
+    Returns:
+        One result for each pattern that could be measured.
     """
     if not measured:
         return ()

@@ -45,13 +45,18 @@ MIN_VALID = 60
 
 
 def wrong_pixels(pixels: np.ndarray, step: float = 0.0) -> np.ndarray:
-    """Return the rows and columns (n, 2) of single wrong pixels, in the order of rows.
+    """Find single pixels that a fault or a particle, and not light, has made brighter or darker
+    than their neighbours.
 
     Pixels within `PATCH_PX` of a border are not evaluated.
 
     Args:
         pixels: (h, w) float32, NaN where they are unknown.
-        step: between the values that pixels can have; 0 if it is not known.
+        step: the difference between successive values that pixels can have, such as 1 DN; 0 if it
+            is not known.
+
+    Returns:
+        The rows and columns (n, 2) of the wrong pixels, in the order of rows.
     """
     size = 2 * PATCH_PX + 1
     if min(pixels.shape) < size:

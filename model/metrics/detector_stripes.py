@@ -60,12 +60,13 @@ SECOND = 1.5
 
 @dataclass(frozen=True)
 class Line:
-    """A single line that is off.
+    """A single line of detectors (a column or row) that differs from its neighbours.
 
     Attributes:
-        index: the index of the line.
-        gain: its deviation from its neighbours over the level around.
-        error: standard error of that.
+        index: the number of the line.
+        gain: the deviation of the line from its neighbours, as a share of the pixel value around
+            it.
+        error: the standard error of `gain`.
     """
 
     index: int
@@ -75,16 +76,18 @@ class Line:
 
 @dataclass(frozen=True)
 class Stripes:
-    """The evaluation of the lines of one direction.
+    """The faults of the lines of one direction, columns or rows, of an image.
 
     Attributes:
-        spread: standard deviation of the lines' gains without noise, over the level; None if it
-            cannot be determined.
-        spread_error: its standard error.
-        significant: whether the spread is significant, and of independent lines.
+        spread: standard deviation of the gains of all lines, without noise, as a share of the pixel
+            value; None if it cannot be determined.
+        spread_error: the standard error of `spread`.
+        significant: True if the spread is significant and relevant, and the lines deviate
+            independently.
         off: single deviating lines, the largest deviation first.
-        dead: lines that are constant while their neighbours are not.
-        grows_with_level: True for gains, False for offsets; None if the levels do not decide.
+        dead: numbers of the lines that are constant while their neighbours are not.
+        grows_with_level: True if the deviations grow with the light (gains), False if not
+            (offsets); None if the image does not show it.
     """
 
     spread: float | None = None
@@ -95,17 +98,17 @@ class Stripes:
     grows_with_level: bool | None = None
 
     def renumbered(self, numbers: Sequence[int]) -> "Stripes":
-        """Return the same with the line of index i called `numbers[i]`."""
+        """Return the same faults with the line of index i called `numbers[i]`."""
         off = tuple(replace(line, index=numbers[line.index]) for line in self.off)
         return replace(self, off=off, dead=tuple(sorted({numbers[index] for index in self.dead})))
 
 
 def judge_lines(blocks: Blocks, least: float) -> Stripes:
-    """Evaluate lines that were measured in blocks.
+    """Decide which lines of detectors are faulty, and how much all lines differ.
 
     Args:
-        blocks: the blocks of all lines.
-        least: the smallest relevant gain, over the level.
+        blocks: the measurements of all lines of one direction.
+        least: the smallest relevant deviation, as a share of the pixel value.
     """
     measurable = np.isfinite(blocks.second) & np.isfinite(blocks.level)
     # A dead line is constant in all blocks where anything is known of it.

@@ -51,9 +51,9 @@ class Effort:
 
     Attributes:
         step_px: only every `step_px`-th row is searched, because edges are longer than that.
-        cell_px: rows, in multiples of `step_px`, and columns of a cell; only the steepest place of
-            each cell is tried.
-        candidates: the number of steepest places whose squares are compared with plain edges.
+        cell_px: the height and width of a cell in pixels, the height a multiple of `step_px`; only
+            the steepest place of each cell is tried.
+        candidates: the number of steepest places whose squares are checked for even sides.
         fits: the number of squares that are fitted, the steepest first.
     """
 
@@ -70,7 +70,13 @@ drawn towns 41 are detected instead of 47 (measured).
 
 
 def blurs_of(squares: np.ndarray, noise: Noise) -> list[EdgeBlur]:
-    """Fit the blurs of those squares (N, S, S) that contain an edge."""
+    """Fit the blur across the edge in each square, and return it for those that contain a clean
+    edge.
+
+    Args:
+        squares: (N, S, S) pixels, each possibly with a near-vertical edge.
+        noise: returns the variance of the noise of pixels of given values.
+    """
     return [fit for fit in fit_blurs(squares, noise, STRICT) if fit is not None]
 
 
@@ -81,17 +87,19 @@ def plain_squares(
     effort: Effort,
     roughness: float = MAX_ROUGHNESS,
 ) -> np.ndarray:
-    """Return squares (N, S, S) around the steepest places of an image, where near-vertical edges
-    may be.
-
-    S is 2 * HALF_PX + 1.
+    """Cut squares around the steepest places of an image, where near-vertical edges between plain
+    sides may be.
 
     Args:
         image: (H, W), finite values; transpose it for near-horizontal edges.
-        noise: the noise of the pixels.
-        clipped_at: values from here on are clipped, and so are those from 0 down.
-        effort: how much is tried.
-        roughness: largest scatter of a square's outer columns beyond noise, of the step.
+        noise: returns the variance of the noise of pixels of given values.
+        clipped_at: the smallest value that counts as clipped. Values of 0 or below are clipped too.
+        effort: limits of the search.
+        roughness: the largest accepted scatter of a square's outer columns beyond noise, relative
+            to the step.
+
+    Returns:
+        The squares (N, S, S), S = 2 * HALF_PX + 1, the steepest first.
     """
     if min(image.shape) <= 2 * MARGIN_PX:
         return np.empty((0, 2 * HALF_PX + 1, 2 * HALF_PX + 1))
@@ -199,15 +207,16 @@ makes.
 
 @dataclass(frozen=True)
 class AxisMtf:
-    """The MTF at Nyquist along one axis.
+    """The MTF at Nyquist along one axis of an image.
 
     Attributes:
         mtf_nyquist: contrast at 0.5 cycles per pixel, averaged over the curve shapes that explain
             the edges.
-        interval: its 95 % interval, from the scatter between edges and between such shapes.
-        edges: the number of edges.
-        nearest: contrast of the profile's curve that is nearest to the edges, whatever their own
-            shape.
+        interval: the ends of its 95 % interval, from the scatter between edges and between these
+            shapes.
+        edges: the number of edges that were measured.
+        nearest: contrast at 0.5 cycles per pixel of the curve MTF(f) = exp(-gamma f) sinc(f), which
+            a sensor's profile states, that is nearest to the edges whatever their own shape.
     """
 
     mtf_nyquist: float
@@ -222,8 +231,9 @@ def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
     The shape of the curve is not fixed: each shape is weighted by how well it explains the edges.
 
     Args:
-        own: the edges across this axis, at least two, all in regions of one size.
-        others: the edges across the other axis.
+        own: the blurs of the edges across this axis, at least two, all in regions of one size.
+        others: the blurs of the edges across the other axis, which correct for inclined edges; may
+            be empty.
     """
     # Imported here: who measures no sensor need not wait for SciPy.
     from scipy.special import stdtrit

@@ -112,13 +112,11 @@ class MtfCurve:
     Attributes:
         contrast: (F,) at FREQUENCIES, falling from 1.
         low: (F,) lower end of the 90 % interval of each.
-        high: (F,) upper end.
-        edges: the number of edges that it is based on.
+        high: (F,) upper end of it.
+        edges: the number of edges that the curve is based on.
         contradicting: labels of edges that differ from the others.
-        lean: mean squared sine of the edges' angle to the axis, which is the share of the other
-            axis.
-        missing_edges: the number of further such edges that would narrow the interval at Nyquist to
-            WIDEST.
+        lean: mean squared sine of the edges' angle to the axis: the share of the other axis.
+        missing_edges: number of further edges that would narrow the interval at Nyquist to WIDEST.
     """
 
     contrast: np.ndarray
@@ -140,7 +138,7 @@ def measure_curve(edges: Sequence[Edge], generator: np.random.Generator) -> MtfC
 
     Args:
         edges: pixels, and the approximate line of each edge.
-        generator: for the draws of the interval.
+        generator: the random generator for the draws of the interval.
     """
     fitted = _first_fits(edges)
     weights = START
@@ -165,7 +163,7 @@ def search_curve(edges: Sequence[Edge], generator: np.random.Generator) -> MtfCu
 
     Args:
         edges: pixels, and the approximate line of each edge.
-        generator: for the draws of the interval.
+        generator: the random generator for the draws of the interval.
     """
     sample = edges[:: max(len(edges) // MOST_FITTED, 1)]
     fitted = sorted(_first_fits(sample), key=lambda edge: edge.unevenness)
@@ -250,8 +248,8 @@ def sharpest(values: np.ndarray, errors: np.ndarray) -> float:
     the posterior is returned, with weak priors for both widths.
 
     Args:
-        values: (N,) softness.
-        errors: (N,) its standard errors.
+        values: (N,) softness of each edge, in pixels, as `uneven_edge.softness` returns it.
+        errors: (N,) its standard error.
     """
     from scipy.optimize import minimize
     from scipy.special import log_ndtr
@@ -381,10 +379,14 @@ def _missing(contrast: np.ndarray, low: np.ndarray, high: np.ndarray, edges: int
 
 
 def apart(own: MtfCurve, other: MtfCurve) -> MtfCurve:
-    """Return the curve of one axis without what inclined edges contribute of the other axis.
+    """Correct the curve of one axis for the other axis, which blurs inclined edges too.
 
     The loss along an edge's normal is sqrt((c loss_own)^2 + (s loss_other)^2), with c and s the
     cosine and sine of its angle, as in a profile's formula (`profiles.response.MtfTable`).
+
+    Args:
+        own: the curve to correct.
+        other: the curve measured along the other axis, not corrected either.
     """
     detector = np.sinc(FREQUENCIES)
     own_loss, other_loss = (np.log(detector / curve.contrast) ** 2 for curve in (own, other))

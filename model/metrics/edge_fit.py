@@ -19,7 +19,7 @@ HALF_PX = 8
 """Half the side of the square around a found edge, and how far from an edge pixels are fitted."""
 
 GAMMAS = np.linspace(0.0, 10.0, 101)
-"""For which the edge is tabulated: MTF at Nyquist from 64 to 0.4 %."""
+"""Values of gamma for which the edge is tabulated: MTF at Nyquist from 64 to 0.4 %."""
 STEEPER = (4.0, 8.0)
 """Gaussian parts that are tried on an edge that the profile's curve does not fit."""
 
@@ -48,17 +48,19 @@ the square of their unit.
 
 @dataclass(frozen=True)
 class EdgeBlur:
-    """The blur across one edge.
+    """The blur that was fitted across one edge.
 
     Attributes:
         gamma: the gamma of MTF(f) = exp(-gamma f) sinc(f), f in cycles per pixel along the edge's
             normal.
-        error: standard error of gamma.
-        slope: pixels by which the edge leans each line; 0 runs along the grid.
-        place: column in which it crosses the middle line, from the middle of the pixels.
-        pixels: (H, W) that it was fitted to, over their noise.
-        chi2: sum of squares that the fit leaves of those near the edge.
-        count: how many these are, less the five numbers fitted.
+        error: the standard error of gamma.
+        slope: the number of columns by which the edge moves from one row to the next; 0 is
+            vertical.
+        place: the column in which the edge crosses the middle row, relative to the middle of the
+            pixels.
+        pixels: the fitted pixels (H, W), divided by the standard deviation of their noise.
+        chi2: the sum of squares of the residuals of the pixels near the edge.
+        count: the number of these pixels, less the five numbers fitted.
     """
 
     gamma: float
@@ -76,13 +78,14 @@ Fit = EdgeBlur | None
 
 @dataclass(frozen=True)
 class Limits:
-    """The limits that an edge must keep to be used.
+    """The quality that the fit of an edge must have for the edge to be used.
 
     Attributes:
-        step_sigma: least difference of the plateaus over the noise of a pixel. A fainter edge may
-            be no edge at all.
-        misfit: largest root mean square that the noise does not explain, relative to the step.
-        error: largest standard error of gamma; 0.6 is a third of the MTF.
+        step_sigma: the least difference of the two sides, in standard deviations of the noise of a
+            pixel. A fainter edge may be no edge at all.
+        misfit: the largest root mean square residual that the noise does not explain, relative to
+            the step.
+        error: the largest standard error of gamma; 0.6 is a third of the MTF.
     """
 
     step_sigma: float
@@ -141,11 +144,12 @@ def fit_blurs(regions: np.ndarray, noise: Noise, limits: Limits) -> list[Fit]:
 
     Args:
         regions: (N, H, W) finite values of any linear unit, rising or falling from left to right.
-        noise: variance of the noise of the pixels.
-        limits: the limits that an edge must keep.
+        noise: returns the variance of the noise of pixels of given values.
+        limits: the quality that a fit must have.
 
     Returns:
-        The blur by the profile's curve; None where no shape of the curve fits.
+        For each region the blur by the curve exp(-gamma f) sinc(f); None where no shape of the
+        curve fits.
     """
     # Over their noise: residuals are then in its standard deviations.
     pixels = regions / np.sqrt(noise(regions).mean((1, 2)))[:, None, None]
@@ -194,12 +198,16 @@ class _Solved(NamedTuple):
 
 
 def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fit]:
-    """Fit edges as `fit_blurs` does, with one Gaussian part only.
+    """Fit the blur of edges as `fit_blurs` does, for one shape of the curve only: exp(-gamma f -
+    shape f^2) sinc(f).
 
     Args:
-        pixels: (N, H, W), scaled such that their noise is 1.
-        limits: the limits that an edge must keep.
-        shape: coefficient of the Gaussian part.
+        pixels: (N, H, W), scaled such that their noise has a standard deviation of 1.
+        limits: the quality that a fit must have.
+        shape: the coefficient of the Gaussian part; 0 is the curve of a sensor's profile.
+
+    Returns:
+        The blur of each edge; None where the fit fails or is not good enough.
     """
     count, height, width = pixels.shape
     fits: list[Fit] = [None] * count
@@ -272,8 +280,8 @@ def _solve(
         x: (P,) columns of a region's pixels.
         y: (P,) their rows.
         values: (N, P) pixels.
-        mask: (N, P) which of them count.
-        shape: the shape of the curve.
+        mask: (N, P) bool, True for the pixels near each edge, which are fitted.
+        shape: the coefficient of the curve's Gaussian part.
     """
     lean = np.sqrt(1 + lines.slope**2)[:, None]
     distance = (x - lines.place[:, None] - lines.slope[:, None] * y) / lean

@@ -45,10 +45,13 @@ def find_edges(image: np.ndarray, noise: Noise, clipped_at: float, label: str) -
     step best are returned.
 
     Args:
-        image: finite values.
-        noise: variance of the noise of the pixels.
-        clipped_at: values from here on are clipped, and so are those from 0 down.
-        label: names the image.
+        image: (H, W), finite values.
+        noise: returns the variance of the noise of pixels of given values.
+        clipped_at: the smallest value that counts as clipped. Values of 0 or below are clipped too.
+        label: the name of the image, for messages on its edges.
+
+    Returns:
+        The pixels and the line of each edge, the best first.
     """
     squares = plain_squares(image, noise, clipped_at, THOROUGH, MAX_ROUGHNESS)
     if not squares.size:
@@ -64,22 +67,25 @@ def find_edges(image: np.ndarray, noise: Noise, clipped_at: float, label: str) -
 
 
 def centre_line(region: np.ndarray) -> EdgeLine:
-    """Fit a line through the centroids of the rise in each row of a region (H, W)."""
+    """Estimate the line of a near-vertical edge in a region (H, W) from the position of the rise in
+    each row.
+    """
     rows, columns = (np.arange(size) - (size - 1) / 2 for size in region.shape)
     lines = centroids(region[None], rows, columns)
     return EdgeLine(float(lines.place[0]), float(np.clip(lines.slope[0], -MAX_SLOPE, MAX_SLOPE)))
 
 
 def edge_in(region: np.ndarray, noise: Noise, label: str) -> Edge | Refusal:
-    """Find the one near-vertical edge that crosses a region (H, W) from top to bottom.
+    """Find the one near-vertical edge that crosses a region from top to bottom, which a person has
+    pointed at.
 
     Args:
-        region: pixels.
-        noise: variance of the noise of the pixels.
-        label: names the edge to the user.
+        region: (H, W) finite pixels.
+        noise: returns the variance of the noise of pixels of given values.
+        label: the name of the edge, for messages.
 
     Returns:
-        The edge, or the reason why there is none.
+        The pixels and the line of the edge, or the reason why there is none.
     """
     scale = math.sqrt(float(noise(region).mean()))
     pixels = EdgePixels(region, noise(region), label)

@@ -21,9 +21,9 @@ def psnr_db(image: np.ndarray, reference: np.ndarray, data_range: float) -> floa
     rounding, but divides by zero for identical images.
 
     Args:
-        image: any shape.
-        reference: the same shape.
-        data_range: the span of legal values, 4095 for 12-bit DN; never guessed from the type.
+        image: pixels of any shape.
+        reference: the pixels to compare with, of the same shape.
+        data_range: the span of valid values, 4095 for 12-bit DN; never guessed from the type.
     """
     difference = np.asarray(image, np.float64) - np.asarray(reference, np.float64)
     error = float(np.mean(difference**2))
@@ -43,8 +43,11 @@ def ssim(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
 
     Args:
         image: (H, W), at least 11 pixels a side.
-        reference: (H, W).
-        data_range: the span of legal values.
+        reference: the image to compare with, (H, W).
+        data_range: the span of valid values, 4095 for 12-bit DN.
+
+    Raises:
+        ImageError: the image is smaller than the window.
     """
     # Imported here, because PSNR alone needs none of its half second.
     from skimage.metrics import structural_similarity
@@ -64,15 +67,16 @@ def ssim(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
 def fidelity_db(
     dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray, max_dn: int = MAX_DN
 ) -> float:
-    """Compute the PSNR in dB over the pixels that neither the input nor the reference clips.
+    """Compute the PSNR in dB of a restored image, over the pixels that neither its input nor the
+    reference clips.
 
     The true values of clipped pixels are unknown. If all pixels are clipped, all are used.
 
     Args:
-        dn: digital numbers of the restored image.
-        reference: those of the reference.
-        degraded: those of the input of the restoration.
-        max_dn: full scale.
+        dn: digital numbers of the restored image, any shape.
+        reference: digital numbers of the image to compare with, of the same shape.
+        degraded: digital numbers of the input of the restoration, of the same shape.
+        max_dn: full scale, from which on a pixel counts as clipped; by default that of 12 bits.
     """
     valid = (reference < max_dn) & (degraded < max_dn)
     valid |= not valid.any()

@@ -56,17 +56,32 @@ WINDOWS_AT_ONCE = 4
 
 
 def image_blocks(images: Iterable[np.ndarray], clipped_at: float, black_dn: float = 0.0) -> Blocks:
-    """Cut images (H, W) of one sensor into blocks, whose means count from the black level."""
+    """Cut images of one sensor into the blocks of 16 x 16 pixels from which its noise is measured.
+
+    Args:
+        images: digital numbers (H, W) of each image.
+        clipped_at: the smallest digital number that counts as clipped; blocks with such a pixel are
+            left out.
+        black_dn: the digital number without light, which is subtracted from the means of the
+            blocks.
+    """
     return above_black(join([cut_blocks(image, clipped_at) for image in images]), black_dn)
 
 
 def above_black(blocks: Blocks, black_dn: float) -> Blocks:
-    """Return blocks whose means count from the black level."""
+    """Return blocks with the black level, the digital number without light, subtracted from their
+    means.
+    """
     return blocks._replace(mean=np.maximum(blocks.mean - black_dn, 0.0))
 
 
 def snr(signal_dn: float, variance: Variance) -> tuple[float, tuple[float, float]]:
-    """Return the SNR of a signal above the dark and its 95 % interval; infinite without noise."""
+    """Compute the SNR of a signal and its 95 % interval; infinite without noise.
+
+    Args:
+        signal_dn: the signal in DN above the digital number without light.
+        variance: the variance of the noise at this signal.
+    """
     # The lowest SNR belongs to the highest variance.
     low, value, high = (
         signal_dn / math.sqrt(dn2) if dn2 > 0 else math.inf
@@ -82,8 +97,11 @@ def axis_mtfs(
 
     Args:
         windows: (h, w) each, finite values; 0 where pixels are missing.
-        noise: variance of the pixels at their values.
-        clipped_at: values from here on are clipped.
+        noise: returns the variance of the noise of pixels of given values.
+        clipped_at: the smallest value that counts as clipped.
+
+    Returns:
+        For each of "across" and "along" the track the MTF, or the reason why there is none.
     """
     turned = [window.T for window in windows]
     across = _short_edges(windows, noise, clipped_at)
@@ -125,8 +143,13 @@ def axis_curves(
     """Measure the whole MTF curve along both axes.
 
     Args:
-        edges: across and along the track, those near the horizontal turned upright.
-        searched: whether they were found by search, so that only the sharpest count.
+        edges: the edges by the axis whose blur they show, "across" or "along" the track. Those near
+            the horizontal are transposed.
+        searched: True if the edges were found by search, so that only the sharpest are used; False
+            if a person confirms them.
+
+    Returns:
+        For each of "across" and "along" the curve, or the reason why there is none.
     """
     measure = search_curve if searched else measure_curve
     generator = np.random.default_rng(SEED)

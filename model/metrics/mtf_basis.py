@@ -45,40 +45,62 @@ SMOOTHING = np.array([1.0, 2.0, 3.0, 2.0, 1.0]) / 9
 
 
 def parts_at(frequencies: ArrayLike) -> np.ndarray:
-    """Evaluate all P_k at frequencies of any shape (...), giving (..., PARTS)."""
+    """Evaluate the simple curves P_k, of which an MTF is a weighted sum.
+
+    Args:
+        frequencies: in cycles per pixel, of any shape (...).
+
+    Returns:
+        The value of each curve, (..., PARTS).
+    """
     frequency = np.asarray(frequencies, np.float64)[..., None]
     falling = np.clip((CORNERS[1:] - frequency) / STEP_CPX, 0.0, 1.0)
     return np.concatenate([falling, np.ones(frequency.shape)], axis=-1)
 
 
 def mtf_at(frequencies: ArrayLike, weights: np.ndarray) -> np.ndarray:
-    """Evaluate the MTF with the weights (PARTS,) at frequencies of any shape, in
-    cycles per pixel.
+    """Evaluate an MTF at some frequencies.
+
+    Args:
+        frequencies: in cycles per pixel, of any shape.
+        weights: (PARTS,) the weights of the simple curves P_k.
+
+    Returns:
+        The contrast, of the same shape.
     """
     frequency = np.asarray(frequencies, np.float64)
     return np.asarray(np.sinc(frequency) * (parts_at(frequency) @ weights))
 
 
 def weights_of(contrast: np.ndarray) -> np.ndarray:
-    """Return the weights (PARTS,) of optics with these contrasts at CORNERS, 1 at the first."""
+    """Return the weights (PARTS,) of the curve that has the contrasts (PARTS,) at CORNERS, without
+    the square detector; the first is 1.
+    """
     return np.append(-np.diff(contrast), contrast[-1])
 
 
 def softened(weights: np.ndarray, softness_px: float) -> np.ndarray:
-    """Return the weights of a curve multiplied by exp(-softness f)."""
+    """Return the weights of an MTF curve that is multiplied by exp(-softness f).
+
+    Args:
+        weights: (PARTS,) of the curve.
+        softness_px: the softness in pixels; a negative one sharpens.
+    """
     contrast = np.append(1.0, 1.0 - np.cumsum(weights[:-1]))
     return weights_of(contrast * np.exp(-softness_px * CORNERS))
 
 
 @cache
 def responses() -> tuple[np.ndarray, np.ndarray]:
-    """Compute the image of a step of 1 at 0, and of a thin line there, for each part.
+    """Compute the image of a step of 1 at 0, and of a thin line there, for each of the simple
+    curves P_k.
 
     The step behind an MTF is 1/2 + the sum over f of MTF(f) sin(2 pi f d) / (pi f). The line is its
     derivative.
 
     Returns:
-        Edges and lines, (2 * REACH_PX * SAMPLES_PER_PX + 1, PARTS) each.
+        Steps and lines, (2 * REACH_PX * SAMPLES_PER_PX + 1, PARTS) each, by the distance from
+        -REACH_PX to REACH_PX pixels.
     """
     frequency = (np.arange(WAVES) + 0.5) * HIGHEST_CPX / WAVES
     distance = np.arange(-REACH_PX * SAMPLES_PER_PX, REACH_PX * SAMPLES_PER_PX + 1) / SAMPLES_PER_PX
@@ -89,7 +111,11 @@ def responses() -> tuple[np.ndarray, np.ndarray]:
 
 
 def at_distances(table: np.ndarray, distance_px: np.ndarray) -> np.ndarray:
-    """Interpolate a tabulated edge or line, (T,) or (T, PARTS), at distances (N,) from it.
+    """Interpolate a table of `responses` at some distances from the edge.
+
+    Args:
+        table: (T,) for one curve or (T, PARTS) for all simple ones.
+        distance_px: (N,) distances in pixels.
 
     Returns:
         Values (N,) or (N, PARTS).
@@ -107,10 +133,16 @@ SECOND_DIFFERENCES = np.pad(np.diff(np.eye(PARTS - 1), 2, axis=0), ((0, 0), (0, 
 
 
 def expected_bends(weights: np.ndarray, bend: float) -> np.ndarray:
-    """Build the matrix (PARTS - 3, PARTS) of the second differences of weights over their expected
-    size.
+    """Build the matrix that computes the bends of a curve, the second differences of its weights,
+    relative to their expected size.
 
-    The expected size is that around `weights` (PARTS,).
+    Args:
+        weights: (PARTS,) of a similar curve. Bends are expected to be larger where these are
+            larger.
+        bend: the expected bend as a share of the weights there.
+
+    Returns:
+        (PARTS - 3, PARTS).
     """
     padded = np.pad(weights[:-1], 2, mode="edge")
     size = np.maximum(np.convolve(padded, SMOOTHING, mode="valid"), LEAST_WEIGHT)[1:-1] * bend
@@ -125,14 +157,18 @@ def solve(
     bend: float,
     bends: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Solve for the best-fitting weights, which are not negative and have the sum 1.
+    """Solve for the weights of the curve that fits best; they are not negative and have the sum 1.
 
     Args:
-        gram: (PARTS, PARTS) of the least-squares problem, in units of the noise.
-        moment: (PARTS,) its right side.
+        gram: (PARTS, PARTS) left side of the normal equations, in units of the noise.
+        moment: (PARTS,) right side of the normal equations.
         near: (PARTS,) weights near the solution; larger ones may bend more.
         bend: the expected bend, as a share of these weights.
-        bends: (PARTS - 3,) expected second differences over their deviations; None for 0.
+        bends: (PARTS - 3,) the second differences to expect, over their standard deviations; None
+            for 0, which is a smooth curve.
+
+    Returns:
+        The weights (PARTS,).
     """
     # Imported here: who measures no sensor need not wait for SciPy.
     from scipy.optimize import nnls
@@ -149,13 +185,13 @@ def solve(
 
 
 def likeliest_bend(gram: np.ndarray, moment: np.ndarray, near: np.ndarray) -> float:
-    """Return the value of BENDS that explains the edges best.
+    """Return the value of BENDS, the expected bend of a curve, that explains the edges best.
 
     It has the largest marginal likelihood of normally distributed weights.
 
     Args:
-        gram: (PARTS, PARTS) of the least-squares problem, in units of the noise.
-        moment: (PARTS,) its right side.
+        gram: (PARTS, PARTS) left side of the normal equations, in units of the noise.
+        moment: (PARTS,) right side of the normal equations.
         near: (PARTS,) weights near the solution.
     """
 

@@ -28,16 +28,20 @@ ROUNDING = 1 / 12
 
 
 class Blocks(NamedTuple):
-    """N blocks of 16 x 16 pixels, less a plane each.
+    """N blocks of 16 x 16 pixels of images: their brightness, and their energy by spatial frequency
+    after subtracting a plane from each.
+
+    An energy is a mean square in DN^2. For white noise each is the variance of the noise.
+    Frequencies are in cycles per pixel.
 
     Attributes:
-        mean: (N,) in DN.
-        structure: (N,) mean square of the waves up to 0.2 cycles per pixel, for white noise its
-            variance in DN^2.
-        middle: (N,) that of the waves from 0.5 to 0.55.
-        fine: (N,) that of the waves beyond.
-        spectrum: (N, 6) that of the waves between the frequencies of SPECTRUM.
-        part: (N,) which part of which image a block lies in.
+        mean: (N,) the mean of each block in DN.
+        structure: (N,) energy of the waves up to 0.2 cycles per pixel.
+        middle: (N,) energy of the waves from 0.5 to 0.55.
+        fine: (N,) energy of the waves beyond 0.55.
+        spectrum: (N, 6) energy of the waves between the frequencies of SPECTRUM.
+        part: (N,) number of the part of 4 x 4 blocks that a block lies in; images have different
+            parts.
     """
 
     mean: np.ndarray
@@ -52,23 +56,29 @@ class Blocks(NamedTuple):
         return Blocks(*(column[mask] for column in self))
 
     def noise(self, fit: np.ndarray) -> np.ndarray:
-        """Return the variance (N,) of the noise of each block by the line (alpha, beta, ...).
+        """Return the variance (N,) of the noise of each block by a fitted line, at least the
+        variance of rounding.
 
-        It is at least the variance of rounding.
+        Args:
+            fit: the numbers of the line, alpha and beta first.
         """
         return np.asarray(np.maximum(fit[0] * self.mean + fit[1], ROUNDING))
 
 
 def join(images: Sequence[Blocks]) -> Blocks:
-    """Join the blocks of several images; their parts remain separate."""
+    """Join the blocks of several images; parts of different images get different numbers."""
     starts = np.cumsum([0] + [int(b.part.max(initial=-1)) + 1 for b in images])
     renumbered = [b._replace(part=b.part + start) for b, start in zip(images, starts, strict=False)]
     return Blocks(*(np.concatenate(column) for column in zip(*renumbered, strict=True)))
 
 
 def cut_blocks(image: np.ndarray, clipped_at: float) -> Blocks:
-    """Cut (H, W) digital numbers into blocks side by side, without those with a pixel at 0 or at
-    `clipped_at`.
+    """Cut an image into blocks side by side and measure them.
+
+    Args:
+        image: digital numbers (H, W).
+        clipped_at: the smallest digital number that counts as clipped. Blocks with a clipped pixel,
+            or with one of 0, are left out.
     """
     pixels, part = _side_by_side(image)
     valid = ((pixels > 0) & (pixels < clipped_at)).all((1, 2))
@@ -77,14 +87,14 @@ def cut_blocks(image: np.ndarray, clipped_at: float) -> Blocks:
 
 
 def cut_pair(first: np.ndarray, second: np.ndarray, clipped_at: float) -> Blocks:
-    """Cut blocks of noise from two images (H, W) of one still scene.
+    """Cut blocks of noise from two images of one still scene.
 
     A block is the difference of the images over the root of 2 (photon transfer). The scene cancels,
-    and so do the fixed deviations of each detector.
+    and so do the fixed deviations of each detector. `mean` is that of both images.
 
     Args:
-        first: digital numbers.
-        second: those of the other image.
+        first: digital numbers (H, W) of one image.
+        second: digital numbers (H, W) of the other image.
         clipped_at: blocks with a value from here on, or of 0, are excluded.
     """
     ones, part = _side_by_side(first)

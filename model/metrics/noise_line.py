@@ -62,8 +62,12 @@ EDGE_PERCENT = 2.0
 
 @dataclass(frozen=True)
 class Variance:
-    """Variance of the noise at one value in DN^2, without that of rounding, and its
-    95 % interval.
+    """The variance of the noise at one pixel value, without the variance of rounding.
+
+    Attributes:
+        value: the variance in DN^2.
+        interval: the ends of its 95 % interval in DN^2.
+        extrapolated: True if the pixel value lies outside the range in which noise was measured.
     """
 
     value: float
@@ -73,19 +77,19 @@ class Variance:
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Variance of the noise in DN^2, alpha * DN + beta, without that of rounding.
+    """The noise of a sensor: its variance in DN^2 is alpha * DN + beta, without that of rounding.
 
     Attributes:
-        alpha: DN.
-        beta: DN^2.
+        alpha: growth of the variance with the pixel value, in DN.
+        beta: variance without light, in DN^2.
         draws: (D, 2) alpha and beta of each draw of the bootstrap.
-        blocks: the number of blocks that were used.
-        measured_dn: the smallest and the largest mean of the blocks.
+        blocks: the number of blocks of 16 x 16 pixels that were used.
+        measured_dn: about the smallest and the largest mean of the blocks, without the outer 2 %.
         leak: share of texture in the corners of the spectrum, which was subtracted.
         colour: noise at middle frequencies over that at the finest; 1 for white noise. The line is
             that of the stronger of the two.
-        white: whether the two are equal within chance.
-        one_level: whether noise was measured at only one level of light, so that its growth with
+        white: True if the two are equal within chance.
+        one_level: True if noise was measured at only one level of light, so that its growth with
             light is assumed.
         spectrum: noise in the bands of SPECTRUM over that beyond FINE.
     """
@@ -102,14 +106,14 @@ class NoiseModel:
     spectrum: tuple[float, ...] = ()
 
     def total(self, dn: np.ndarray) -> np.ndarray:
-        """Return the variance of pixels with the values `dn` (any shape), including that of
-        rounding.
+        """Return the variance in DN^2 of pixels with the values `dn` (any shape), including the
+        variance of rounding.
         """
         return np.asarray(self.alpha * np.maximum(dn, 0) + self.beta + ROUNDING)
 
     def at(self, dn: float) -> Variance:
-        """Return the variance at one value and its interval, which is wider outside the measured
-        range.
+        """Return the variance of the noise at one pixel value above 0; its interval is wider
+        outside the measured range.
         """
         value = self.alpha * dn + self.beta
         low, high = np.percentile(self.draws @ (dn, 1.0), [2.5, 97.5])
@@ -123,13 +127,16 @@ class NoiseModel:
 
 
 def fit_noise(blocks: Blocks, incomplete: bool = False) -> NoiseModel | Refusal:
-    """Fit the line to blocks of any number of images of one sensor, or return why there is none.
+    """Fit the line variance = alpha * DN + beta to blocks of any number of images of one sensor.
 
     The draws of the interval are always the same.
 
     Args:
         blocks: the blocks of all images.
         incomplete: whether to accept noise that is not white, and noise at only one level of light.
+
+    Returns:
+        The line, or the reason why these images do not determine one.
     """
     if blocks.mean.size < LEAST:
         return Refusal(f"{blocks.mean.size} blocks of 16 x 16 unclipped pixels, {LEAST} are needed")

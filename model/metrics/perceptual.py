@@ -30,13 +30,18 @@ from beers_deploy.profiles.toml import unreadable
 
 @dataclass(frozen=True)
 class BackboneSpec:
-    """The architecture of a backbone, known without its weights."""
+    """The architecture of a backbone, the image network whose features LPIPS and DISTS compare.
 
-    # What torchvision calls it, and the start of its file's name.
+    Attributes:
+        file_stem: torchvision's name of the network, with which the name of its weights file
+            begins.
+        taps: the indices of the feature layers that are compared.
+        min_side_px: the smallest side of an image; a smaller one leaves nothing for the last
+            pooling.
+    """
+
     file_stem: str
-    # The feature layers that are compared.
     taps: tuple[int, ...]
-    # A smaller image leaves nothing for the last pooling.
     min_side_px: int
 
 
@@ -49,8 +54,9 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 class Fire(nn.Module):
-    """A block of SqueezeNet: a narrow 1x1 convolution, then 1x1 and 3x3 convolutions
-    side by side.
+    """A block of SqueezeNet: a narrow 1x1 convolution, then 1x1 and 3x3 convolutions side by side.
+
+    Its arguments are the channels of the input, of the first and of each of the other convolutions.
     """
 
     def __init__(self, inputs: int, squeezed: int, expanded: int) -> None:
@@ -60,7 +66,7 @@ class Fire(nn.Module):
         self.expand3x3 = nn.Conv2d(squeezed, expanded, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map (N, inputs, H, W) to (N, 2 expanded, H, W)."""
+        """Compute the block's output: (N, inputs, H, W) to (N, 2 expanded, H, W)."""
         x = functional.relu(self.squeeze(x))
         return functional.relu(torch.cat([self.expand1x1(x), self.expand3x3(x)], dim=1))
 
@@ -71,7 +77,7 @@ class L2Pool(nn.Module):
     """
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map (N, C, H, W) to (N, C, ceil(H / 2), ceil(W / 2))."""
+        """Pool each channel by 2: (N, C, H, W) to (N, C, ceil(H / 2), ceil(W / 2))."""
         taps = x.new_tensor([0.25, 0.5, 0.25])
         kernel = (taps[:, None] * taps[None, :]).expand(x.shape[1], 1, 3, 3)
         energy = functional.conv2d(x * x, kernel, stride=2, padding=1, groups=x.shape[1])
@@ -79,9 +85,11 @@ class L2Pool(nn.Module):
 
 
 class Backbone(nn.Module):
-    """The feature layers of "squeeze" or "vgg", with random weights until weights are loaded.
+    """The feature layers of a network that LPIPS or DISTS uses, with random weights until weights
+    are loaded.
 
-    `l2_pool` replaces max pooling by DISTS's pooling.
+    `network` is "squeeze" (SqueezeNet 1.1) or "vgg" (VGG16). `l2_pool` replaces max pooling by
+    DISTS's pooling.
     """
 
     def __init__(self, network: str, *, l2_pool: bool = False) -> None:
@@ -156,8 +164,9 @@ def find_backbone(network: str, place: Path | None = None) -> Path | None:
     """Find the weights file of "squeeze" or "vgg" (for DISTS), or return None.
 
     If it is None, `not_found(network)` is the reason to show. A file given as `place` is returned
-    unchecked. Without `place` (a file or a folder), the environment variable BEERS_LPIPS_WEIGHTS is
-    read. A file that it names is used only for the network with which its name begins.
+    unchecked. Without `place`, which may also be a folder to search, the environment variable
+    BEERS_LPIPS_WEIGHTS names the file or folder. A file that it names is used only for the network
+    with whose file stem its name begins.
     """
     stem = BACKBONES[network].file_stem
     if place is not None and not place.is_dir():
@@ -172,7 +181,9 @@ def find_backbone(network: str, place: Path | None = None) -> Path | None:
 
 
 def not_found(network: str) -> str:
-    """Return the reason why a metric is unavailable if `find_backbone` returned None."""
+    """Return a sentence that says which weights file of "squeeze" or "vgg" is missing, after
+    `find_backbone` returned None.
+    """
     names = " or ".join(f"{BACKBONES[network].file_stem}*{suffix}" for suffix in SUFFIXES)
     return f"weights not found: no {names}; set {WEIGHTS_VARIABLE} to the file or its folder"
 
@@ -182,8 +193,11 @@ def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbon
 
     Args:
         network: "squeeze" or "vgg".
-        path: the weights file.
+        path: the weights file, .safetensors or .npz.
         l2_pool: whether to use DISTS's pooling.
+
+    Raises:
+        ModelError: the file cannot be read, or lacks a finite tensor of the right shape.
     """
     backbone = Backbone(network, l2_pool=l2_pool)
     parameters = backbone.state_dict()
@@ -201,8 +215,10 @@ def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbon
 
 
 def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
-    """Read the tensors in `names` from a .safetensors or .npz file as float32, or
-    raise ModelError.
+    """Read the tensors in `names` from a .safetensors or .npz file as float32, by name.
+
+    Raises:
+        ModelError: the file cannot be read, lacks a tensor, or holds no floating-point numbers.
     """
     if path.suffix not in SUFFIXES:
         raise ModelError(
@@ -253,8 +269,8 @@ class Lpips(nn.Module):
     no upper bound.
 
     Name it with its network, "LPIPS-squeeze" (`label`), because figures of different networks
-    cannot be compared. The heads (C,), one for each compared layer, are the weights of the
-    channels.
+    cannot be compared. Its argument `heads` has the weights of the channels of each compared layer,
+    (C,) each; its attribute `heads` joins them.
     """
 
     heads: Tensor
@@ -268,8 +284,8 @@ class Lpips(nn.Module):
 
     @classmethod
     def load(cls, network: str, path: Path) -> Self:
-        """Load the metric with its published heads, over the backbone in a file (see
-        `find_backbone`).
+        """Load the metric with its published heads, over the backbone "squeeze" or "vgg" whose
+        weights are in the file `path` (see `find_backbone`).
         """
         backbone = load_backbone(network, path)
         names = [f"lin{layer}" for layer in range(len(backbone.spec.taps))]
@@ -277,9 +293,10 @@ class Lpips(nn.Module):
         return cls(backbone, [heads[name] for name in names])
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
-        """Compute the distance (N,) of each pair (N, 1, H, W), 0 to 1 of full scale.
+        """Compute the distance (N,) of each pair of grey images (N, 1, H, W), from 0 to 1 of full
+        scale.
 
-        Its gradient is finite everywhere.
+        Its gradient is finite everywhere. Images of other shapes, or too small, raise ImageError.
         """
         _check_pair(self.label, self.backbone, image, reference)
         with torch.autocast(image.device.type, enabled=False):
@@ -310,17 +327,18 @@ class Dists(nn.Module):
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Load the metric with its published weights, over the VGG16 in a file
-        (`find_backbone("vgg")`).
+        """Load the metric with its published weights, over the VGG16 whose weights are in the file
+        `path` (`find_backbone("vgg")`).
         """
         backbone = load_backbone("vgg", path, l2_pool=True)
         weights = read_tensors(PUBLISHED / "dists.safetensors", ["alpha", "beta"])
         return cls(backbone, weights["alpha"], weights["beta"])
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
-        """Compute the distance (N,) of each pair (N, 1, H, W), 0 to 1 of full scale.
+        """Compute the distance (N,) of each pair of grey images (N, 1, H, W), from 0 to 1 of full
+        scale.
 
-        Its gradient is finite everywhere.
+        Its gradient is finite everywhere. Images of other shapes, or too small, raise ImageError.
         """
         _check_pair(self.label, self.backbone, image, reference)
         with torch.autocast(image.device.type, enabled=False):

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Refusal:
-    """The result of a measurement without a figure. It is no error: the image lacks what the
+    """The result of a measurement that yields no figure. It is no error: the image lacks what the
     measurement needs.
 
-    `reason` is one sentence with the numbers behind it.
+    Attributes:
+        reason: a phrase with the numbers behind it, such as "2 straight edges, 3 are needed".
     """
 
     reason: str

@@ -45,7 +45,8 @@ def edge_mtf(image: np.ndarray, angle_deg: float, saturated: float = math.inf) -
     Args:
         image: (H, W) pixels of any linear unit, 12-bit DN or radiance; about 80 x 80.
         angle_deg: the angle given to `slanted_edge`, 2 to 15 degrees.
-        saturated: the value at which pixels clip, in the image's unit. They also clip at 0.
+        saturated: the value at which pixels clip, in the image's unit; infinity if they do not.
+            They also clip at 0.
 
     Returns:
         Contrast at 0.5 cycles per pixel, below 0 by noise or if contrast is reversed; or the reason
@@ -116,15 +117,15 @@ its tails are cut at 50 px.
 
 @dataclass(frozen=True)
 class Plateaus:
-    """Fit of low + c / |d| on the left and high - c / |d| on the right of the edge, d the distance
-    in pixels.
+    """The two sides of an edge: low + c / |d| on the left and high - c / |d| on the right, d the
+    distance in pixels.
 
     Attributes:
-        low: far on the left.
+        low: the pixel value far on the left.
         step: difference of the plateaus far from the edge: the DC of the MTF.
         tail_px: a = pi c / step, the tails of a PSF whose MTF begins as exp(-2 pi a |f|); 0 or
             more.
-        sigma: scatter of a pixel around the fit.
+        sigma: root mean square deviation of the pixels from the fit.
     """
 
     low: float
@@ -133,17 +134,23 @@ class Plateaus:
     sigma: float
 
     def transfer(self, frequencies: ArrayLike, softness_px: float) -> np.ndarray:
-        """Return the MTF of an edge with these tails and a Gaussian blur, at frequencies of any
-        shape.
+        """Return the MTF of an edge with these tails and a Gaussian blur.
 
-        The Gaussian has the standard deviation `softness_px`.
+        Args:
+            frequencies: in cycles per pixel, of any shape.
+            softness_px: the standard deviation of the Gaussian in pixels.
         """
         frequencies = np.asarray(frequencies)
         gaussian = np.exp(-2 * (math.pi * softness_px * frequencies) ** 2)
         return np.asarray(np.exp(-2 * math.pi * self.tail_px * frequencies) * gaussian)
 
     def model(self, distance: np.ndarray, softness_px: float) -> np.ndarray:
-        """Return the image of that edge, (N,), at distances (N,) of a few pixels."""
+        """Return the pixel values (N,) of an edge with these sides and tails and a Gaussian blur.
+
+        Args:
+            distance: (N,) distances from the edge, a few pixels at most.
+            softness_px: the standard deviation of the Gaussian in pixels.
+        """
         f = MODEL_FREQUENCIES
         waves = np.sin(2 * math.pi * f * distance[:, None]) / (math.pi * f)
         return np.asarray(
@@ -222,24 +229,24 @@ def _transform(variance_px2: float) -> np.ndarray:
 def slanted_edge(
     side_px: int, oversampling: int, angle_deg: float, radiance: tuple[float, float] = (40.0, 200.0)
 ) -> np.ndarray:
-    """Draw a straight edge through the middle of a square scene, (S, S) with S = side_px *
-    oversampling.
+    """Draw a straight edge through the middle of a square scene, from which `edge_mtf` measures a
+    sensor.
 
     Simulate a scene much larger than the part you measure: its borders wrap around, which creates a
     second edge there. 240 target pixels for a central part of 80 leave an error of 0.05 MTF points
     (measured).
 
     Args:
-        side_px: side of the scene in target pixels.
-        oversampling: scene pixels per target pixel.
+        side_px: side of the scene in target pixels, the pixels of the sensor.
+        oversampling: the number of scene pixels along a target pixel.
         angle_deg: angle from the vertical; a positive one moves the lower end of the edge to the
             left.
         radiance: W/m2/sr/um on the left and on the right.
 
     Returns:
-        (side_px * oversampling,) * 2 float32 radiance. Edge pixels hold the share that the edge
-        covers. The blur of that averaging, 1.6 % at Nyquist for an oversampling of 5, is removed to
-        fourth order, with an overshoot of some 4 % of the step.
+        Radiance (S, S) float32, S = side_px * oversampling. Edge pixels hold the share that the
+        edge covers. The blur of that averaging, 1.6 % at Nyquist for an oversampling of 5, is
+        removed to fourth order, with an overshoot of some 4 % of the step.
     """
     angle = math.radians(angle_deg)
     place = np.arange(-2, side_px * oversampling + 2) - (side_px * oversampling - 1) / 2

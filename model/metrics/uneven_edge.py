@@ -57,8 +57,8 @@ class EdgePixels:
 
     Attributes:
         values: (H, W) digital numbers.
-        variance: (H, W) of their noise.
-        label: names the edge to the user.
+        variance: (H, W) variance of the noise of each pixel.
+        label: the name of the edge, for messages.
     """
 
     values: np.ndarray
@@ -67,8 +67,13 @@ class EdgePixels:
 
 
 class EdgeLine(NamedTuple):
-    """The line of an edge: x = place + slope * y + bow * (2 y / H)^2, from the middle of its
-    pixels.
+    """The line of an edge: x = place + slope * y + bow * (2 y / H)^2, from the middle of its H
+    rows.
+
+    Attributes:
+        place_px: the column in which the edge crosses the middle row, relative to the middle.
+        slope: the number of columns by which the edge moves from one row to the next.
+        bow_px: the deviation from a straight line at both ends, in pixels.
     """
 
     place_px: float
@@ -77,8 +82,13 @@ class EdgeLine(NamedTuple):
 
 
 class Side(NamedTuple):
-    """Pixels within HALF_PX of an edge, (P,) each: distance and place along it in pixels, values
-    and variance.
+    """The pixels within HALF_PX of an edge on both sides, (P,) each.
+
+    Attributes:
+        distance_px: the signed distance from the edge; negative on the left.
+        along_px: the row, relative to the middle.
+        values: the pixel values.
+        variance: the variance of the noise of each pixel.
     """
 
     distance_px: np.ndarray
@@ -94,17 +104,17 @@ class FittedEdge:
     Attributes:
         pixels: the pixels of the edge.
         line: the line of the edge.
-        levels: (6,) left and right plane: in the middle, change over half the length, change over
-            HALF_PX.
+        levels: (6,) the left plane, then the right one: pixel value in the middle of the edge,
+            change over half the edge's length along it, change over HALF_PX across it.
         weights: (P,) one over the standard deviation of each pixel near the edge, including texture
             and Huber's weight.
         step: difference of the planes at the edge.
         unevenness: root mean square of the residual texture of the planes, relative to the step.
-        normal: (P + 9, 9) weighted derivatives by planes and line, followed by their
-            regularisation.
-        curve: (P + 9, PARTS) derivatives by the weights of the curve.
-        rest: (P + 9,) the residual.
-        strip: (P,) number of the strip that each pixel lies in.
+        normal: (P + 9, 9) weighted derivatives of the P pixels by planes and line, followed by the
+            rows that regularise these 9 numbers.
+        curve: (P + 9, PARTS) weighted derivatives by the weights of the curve, followed by zeros.
+        rest: (P + 9,) the weighted residuals, followed by the right side of the regularisation.
+        strip: (P,) number of the strip along the edge that each pixel lies in.
     """
 
     pixels: EdgePixels
@@ -122,16 +132,16 @@ class FittedEdge:
 def fit_edge(
     pixels: EdgePixels, line: EdgeLine, weights: np.ndarray, passes: int
 ) -> FittedEdge | None:
-    """Fit the line and both planes of an edge to a known curve.
+    """Fit the line and both planes of an edge to a known MTF curve.
 
     Args:
-        pixels: around the edge.
-        line: where it runs roughly, within a pixel or two.
-        weights: (PARTS,) of the curve.
-        passes: the passes of Gauss-Newton.
+        pixels: the pixels around the edge.
+        line: where the edge runs approximately, within a pixel or two.
+        weights: (PARTS,) of the curve, as in `mtf_basis`.
+        passes: the number of iterations of Gauss-Newton.
 
     Returns:
-        The edge, or None where it leaves its pixels or has no step.
+        The edge, or None if it leaves its pixels or has no step.
     """
     edges, lines = responses()
     edge_table = edges @ weights
@@ -242,16 +252,17 @@ def _expectations(levels: np.ndarray, line: EdgeLine, step: float) -> tuple[np.n
 def normal_equations(
     edge: FittedEdge, weights: np.ndarray, counts: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the normal equations of the curve from one edge, with its line and planes projected
-    out.
+    """Compute what one edge says about the MTF curve, as normal equations with its line and planes
+    projected out.
 
     Args:
-        edge: fitted to `weights`.
-        weights: (PARTS,) of the curve.
-        counts: how often each strip along the edge counts; None counts each once.
+        edge: the edge, fitted to the curve of `weights`.
+        weights: (PARTS,) of the curve, as in `mtf_basis`.
+        counts: the number of times that each strip along the edge counts; None counts each once.
 
     Returns:
-        (PARTS, PARTS) and (PARTS,): left and right side for the weights of the curve.
+        The left side (PARTS, PARTS) and the right side (PARTS,) of the equations for the weights of
+        the curve; those of several edges are added.
     """
     normal = edge.normal
     curve = edge.curve
@@ -270,15 +281,22 @@ def normal_equations(
 
 
 def strips_of(edge: FittedEdge) -> int:
-    """Return the number of independent strips along the edge."""
+    """Return the number of independent strips, of STRIP_PX rows each, along the edge."""
     return max(int(edge.pixels.values.shape[0]) // STRIP_PX, 2)
 
 
 def softness(edge: FittedEdge, weights: np.ndarray) -> tuple[float, float]:
-    """Estimate by how much an edge is softer than a curve, and the standard error of that.
+    """Estimate by how much an edge is softer than an MTF curve, and the standard error.
 
     The softness is s in pixels of a further factor exp(-s f). Its error is the larger of two: that
     from noise and texture, and that from the differences between the strips along the edge.
+
+    Args:
+        edge: the edge, fitted to the curve of `weights`.
+        weights: (PARTS,) of the curve, as in `mtf_basis`.
+
+    Returns:
+        The softness and its standard error, both in pixels.
     """
     by_softness = edge.curve @ (softened(weights, SOFTER_PX) - weights) / SOFTER_PX
     basis, _ = np.linalg.qr(edge.normal)

@@ -31,13 +31,20 @@ or the raw file, or are written from other facts.
 
 
 def mask_file(path: Path) -> Path:
-    """Return where GDAL stores the mask of an image whose format has none."""
+    """Return the path at which GDAL stores the validity mask of an image whose format has none."""
     return path.with_name(f"{path.name}.msk")
 
 
 def raster_of(path: Path, dataset: Any) -> Raster:
-    """Return the properties that GDAL states of an image; raise ImageError if it cannot be
-    restored.
+    """Return the properties that GDAL states of an open image.
+
+    Args:
+        path: the path of the image, for messages and for facts that GDAL does not read.
+        dataset: the image as rasterio has opened it.
+
+    Raises:
+        ImageError: the image cannot be restored: it has complex or inverted pixels, unlike bands,
+            several pages, or is too large.
     """
     name = str(path)
     _require_one_image(name, dataset)
@@ -135,10 +142,10 @@ def _require_light(name: str, dataset: Any) -> None:
 
 
 def _bits(path: Path, dataset: Any) -> int | None:
-    """Return the bits per pixel that the file states, the largest of its bands'; None where any
+    """Return the number of bits per pixel that the file states, the largest of its bands; None if a
     band states none.
 
-    A DIMAP states those of the product.
+    An image with a DIMAP index has the bits that the index states for the whole product.
     """
     if (product_bits := dimap_bits(path)) is not None:
         return product_bits
@@ -152,7 +159,7 @@ def _bits(path: Path, dataset: Any) -> int | None:
 
 
 def _place(dataset: Any) -> Place:
-    """Return where an image lies: by a transform, or by ground control points."""
+    """Return where an image lies on Earth: by a transform, or by ground control points."""
     points, points_crs = dataset.gcps
     identity = dataset.transform.is_identity
     return Place(

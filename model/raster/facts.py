@@ -32,18 +32,23 @@ ControlPoint = tuple[float, float, float, float, float]
 
 
 class Extent(NamedTuple):
-    """The largest absolute value among some pixels, and whether all of them are integers."""
+    """A summary of some pixels, by which their unit is guessed.
+
+    Attributes:
+        largest: the largest absolute value, 0 if there are no pixels.
+        whole: True if all values are integers.
+    """
 
     largest: float
     whole: bool
 
 
 def extent_of(pixels: np.ndarray, valid: np.ndarray | bool = True) -> Extent:
-    """Return the extent of pixels of any shape.
+    """Return the largest absolute value of some pixels, and whether all are integers.
 
     Args:
-        pixels: values as stored.
-        valid: which of them count, bool of the same shape.
+        pixels: values as stored in the file, of any shape.
+        valid: bool of the same shape, True for the pixels to consider; by default all.
     """
     low, high = (float(extreme(pixels, where=valid, initial=0)) for extreme in (np.min, np.max))
     integers = pixels.dtype.kind != "f" or bool((np.rint(pixels) == pixels).all(where=valid))
@@ -56,10 +61,12 @@ class Place:
 
     Attributes:
         crs: the coordinate reference system of `transform` or of the ground control points.
-        transform: the affine transform from pixel corners (column, row) to coordinates.
+        transform: the affine transform from pixel corners (column, row) to coordinates; None
+            without one.
         gcps: ground control points; GDAL reads these or a transform.
-        rpcs: rational polynomial coefficients, by GDAL's names.
-        area_or_point: whether a pixel's value is that of an area or a point, GDAL's AREA_OR_POINT.
+        rpcs: rational polynomial coefficients, as pairs of GDAL's name and the text of the value.
+        area_or_point: "Area" or "Point", GDAL's AREA_OR_POINT: what the value of a pixel stands
+            for; empty if the file does not state it.
     """
 
     crs: Any = None
@@ -105,8 +112,14 @@ def _number(text: str) -> float:
 
 @dataclass(frozen=True)
 class BandInfo:
-    """The description of one band in a file: its name, its unit, and the conversion from pixels to
-    physical values.
+    """The description of one band in a file.
+
+    Attributes:
+        name: the name of the band; empty without one.
+        unit: the unit of the physical values; empty without one.
+        scale: physical value = scale * pixel + offset.
+        offset: see `scale`.
+        tags: further metadata items of the band, as pairs of name and text.
     """
 
     name: str = ""
@@ -118,21 +131,23 @@ class BandInfo:
 
 @dataclass(frozen=True)
 class Raster:
-    """An image as stored: `bands` planes of (height_px, width_px).
+    """The facts of an image file before its pixels are read: `bands` planes of (height_px,
+    width_px).
 
     Attributes:
-        bands: planes of light; alpha is none of them.
-        height_px: rows.
-        width_px: columns.
+        bands: the number of planes of light; an alpha band is not counted.
+        height_px: the number of rows.
+        width_px: the number of columns.
         dtype: the dtype of the pixels.
         nodata: the value of missing pixels; None without one.
-        bits: bits of a pixel that the sensor fills, where the file states them.
-        mask_kind: what marks missing pixels besides NaN and `nodata`.
-        colour: whether the bands are red, green and blue.
-        restored: whether `restore` has written the image.
-        place: where it lies.
+        bits: the number of bits of a pixel that the sensor uses; None if the file does not state
+            it.
+        mask_kind: what marks missing pixels in addition to NaN and `nodata`; empty if nothing does.
+        colour: True if the bands are red, green and blue.
+        restored: True if this project's `restore` has written the image.
+        place: where the image lies on Earth.
         band_info: names, units and scales; empty, or one for each band.
-        tags: the file's metadata items that a restored image keeps.
+        tags: the file's metadata items that a restored image keeps, as pairs of name and text.
     """
 
     bands: int
@@ -165,9 +180,15 @@ class Raster:
         return names if all(names) else ()
 
     def missing(self, pixels: np.ndarray) -> np.ndarray:
-        """Return which stored pixels hold no measurement, bool of the same shape.
+        """Return which pixels hold no measurement, because they are NaN, have the nodata value, or
+        are masked.
 
-        They are NaN, have the nodata value, or are masked.
+        Args:
+            pixels: pixels of this image as stored, of any shape; a masked array if the image has a
+                mask.
+
+        Returns:
+            Bool of the same shape, True for missing pixels.
         """
         flags = np.ma.getmaskarray(pixels).copy()
         values = np.ma.getdata(pixels)
@@ -178,30 +199,36 @@ class Raster:
         return flags
 
     def extent(self, pixels: np.ndarray) -> Extent:
-        """Return the extent of the stored pixels that are not missing."""
+        """Return the largest absolute value of the pixels that are not missing, and whether all are
+        integers.
+        """
         return extent_of(np.ma.getdata(pixels), ~self.missing(pixels))
 
     @property
     def may_miss(self) -> bool:
-        """True if any pixel could be missing."""
+        """True if the image can have missing pixels: if its pixels are floats, or it has a nodata
+        value or a mask.
+        """
         return self.dtype.kind == "f" or self.nodata is not None or bool(self.mask_kind)
 
     def fill_margin_px(self, radius_px: int) -> int:
-        """Return how many pixels around a window must be read to fill its missing pixels.
+        """Return the number of pixels around a tile that must be read too, to fill the missing
+        pixels of the tile.
 
         Args:
             radius_px: the receptive radius of the network. Farther pixels do not matter.
 
         Returns:
-            0 if the image cannot have missing pixels.
+            `radius_px`, or 0 if the image cannot have missing pixels.
         """
         return radius_px if self.may_miss else 0
 
     def enlarged(self, shape: Sequence[int]) -> "Raster":
-        """Return the facts of this image restored to another shape.
+        """Return the facts of the restored image, which may have more pixels and other bands.
 
         Args:
-            shape: (bands, H, W); H and W are multiples of this image's.
+            shape: the shape (bands, H, W) of the restored image; H and W are multiples of the size
+                of this image.
         """
         bands, height_px, width_px = shape
         alike = bands == self.bands
@@ -218,7 +245,9 @@ class Raster:
 
 
 def require_size(name: str, bands: int, height_px: int, width_px: int) -> None:
-    """Raise ImageError if an image is too large to be planned."""
+    """Raise ImageError if an image is too large, so that even planning its tiles would take too
+    much memory.
+    """
     if max(height_px, width_px) > SIDE_PX or bands > BANDS:
         raise ImageError(
             f"{name} has {bands} bands of {width_px} x {height_px} pixels, but at most {BANDS} "
@@ -227,7 +256,7 @@ def require_size(name: str, bands: int, height_px: int, width_px: int) -> None:
 
 
 def require_numbers(name: str, dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the type of the pixels; raise ImageError for complex numbers."""
+    """Return the type of the pixels; raise ImageError if it is no integer or float type."""
     if dtype.kind not in "uif":
         raise ImageError(
             f"{name} must have integer or float pixels, got {dtype}. Convert it to uint16."
@@ -236,12 +265,14 @@ def require_numbers(name: str, dtype: np.dtype[Any]) -> np.dtype[Any]:
 
 
 def require_small_offset(name: str, offset: float, scale: float) -> None:
-    """Raise ImageError if no light is far from pixel value 0, by value = scale x pixel + offset.
+    """Raise ImageError if a pixel value of 0 does not mean, approximately, that there is no light.
+
+    Physical value = scale x pixel + offset, so that no light has the pixel value -offset / scale.
 
     Args:
         name: the name of the image, for the message.
-        offset: the offset of the pixels.
-        scale: the scale of the pixels.
+        offset: the offset that the file states for its band.
+        scale: the scale that the file states for its band.
     """
     if abs(offset) > OFFSET_DN * abs(scale):
         dark = -offset / (scale or 1)
@@ -253,7 +284,7 @@ def require_small_offset(name: str, offset: float, scale: float) -> None:
 
 
 def usable_nodata(value: float | None, dtype: np.dtype[Any]) -> float | None:
-    """Return a nodata value, or None for one that no pixel of this type can have."""
+    """Return the nodata value of an image, or None if no pixel of its type can have this value."""
     if value is None or dtype.kind == "f":
         return value
     limits = np.iinfo(dtype)
@@ -263,13 +294,22 @@ def usable_nodata(value: float | None, dtype: np.dtype[Any]) -> float | None:
 
 
 def is_restored(software: str, metadata: object) -> bool:
-    """Return True if an image was written by `restore`, by its software or its metadata."""
+    """Return True if this project's `restore` has written an image.
+
+    Args:
+        software: the software that the file names, its tag TIFFTAG_SOFTWARE.
+        metadata: all metadata items of the file.
+    """
     return software.startswith(RESTORED) or RESTORED_BY in str(metadata)
 
 
 def require_raw(name: str, restored: bool, force: bool) -> None:
-    """Raise ImageError if the image was restored before, unless `force`: a second restoration
-    over-sharpens it.
+    """Raise ImageError if an image was restored before: a second restoration over-sharpens it.
+
+    Args:
+        name: the name of the image, for the message.
+        restored: True if the image was restored before.
+        force: True if the user wants to restore it all the same, so that no error is raised.
     """
     if restored and not force:
         raise ImageError(

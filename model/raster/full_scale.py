@@ -30,16 +30,22 @@ def settled_scale(
     usual: float = MAX_DN,
     remedy: str | None = None,
 ) -> float:
-    """Determine the pixel value that is full scale, or raise ImageError if it is ambiguous.
+    """Determine the pixel value that is full scale, which a network reads as 1.0.
 
     Args:
         name: the name of the image, for the message.
         dtype: the dtype of the pixels.
-        extents: the extents of each part of the image; read for floats only, up to the first part
-            that decides.
-        asked: the value that the user gave; None lets type and values decide.
-        usual: the full scale of digital numbers.
-        remedy: a sentence on what to do if it is ambiguous and the caller has no `full_scale`.
+        extents: the extents (`facts.extent_of`) of successive parts of the image. They are only
+            consumed for float pixels, up to the first part that decides.
+        asked: the value that the user gave, which is returned; None lets type and values decide.
+        usual: the full scale of digital numbers, by default that of 12 bits.
+        remedy: the advice in the message if full scale is ambiguous; None advises to set
+            `full_scale`.
+
+    Raises:
+        ImageError: the pixels have 8 bits, or are floats that may be digital numbers, radiances or
+            shares of full scale.
+        OptionError: no pixel of this type can have the value `asked`.
     """
     if asked is not None:
         check_scale(asked, dtype.kind)
@@ -66,7 +72,12 @@ def settled_scale(
 
 
 def check_scale(full_scale: float, kind: str) -> None:
-    """Raise OptionError if pixels of this kind (NumPy's letter) cannot have this full scale."""
+    """Raise OptionError if pixels of a type cannot have a full scale.
+
+    Args:
+        full_scale: the pixel value to check.
+        kind: NumPy's letter for the type of the pixels, "f" for floats.
+    """
     fits_integers = full_scale <= 65535 and full_scale % 1 == 0
     if 0 < full_scale < np.inf and (kind == "f" or fits_integers):
         return
@@ -75,9 +86,12 @@ def check_scale(full_scale: float, kind: str) -> None:
 
 
 def remedy_outside(low: float, high: float, remedy: str) -> str:
-    """Return a sentence of advice about values from `low` to `high` that no sensor produces.
+    """Return a sentence that says what to do about pixels outside the range of the sensor.
 
-    It is `remedy` if they are only too large.
+    Args:
+        low: the smallest pixel value of the image.
+        high: the largest pixel value of the image.
+        remedy: the sentence to return if the values are only too large.
     """
     if not np.isfinite([low, high]).all():
         return (

@@ -62,7 +62,7 @@ def read_pixels(path: Path) -> np.ndarray:
 
 
 def image_size_px(path: Path) -> tuple[int, int]:
-    """Return height and width of an image file as its header states them."""
+    """Return the height and width of an image in pixels; only the header of the file is read."""
     with open_raster(path) as source:
         return source.raster.height_px, source.raster.width_px
 
@@ -92,14 +92,21 @@ def site_of(name: str) -> str:
 def read_acquisition(
     path: Path, full_scale: float | None = None, remedy: str | None = RESCALE, max_dn: int = MAX_DN
 ) -> np.ndarray:
-    """Read the digital numbers (H, W) float32 of a mono image, from 0 to max_dn.
+    """Read the digital numbers (H, W) float32 of an image with one band, from 0 to max_dn.
 
     Args:
-        path: a TIFF, PNG or JPEG file.
+        path: the path of an image file.
         full_scale: the pixel value that is full scale; None lets the pixels' type and values
-            decide.
-        remedy: a sentence on what to do if full scale is ambiguous; None names `full_scale`.
+            decide. Pixels are multiplied so that it becomes `max_dn`.
+        remedy: the advice in the message if full scale is ambiguous; None advises to set
+            `full_scale`.
         max_dn: the sensor's largest digital number, by default that of 12 bits.
+
+    Raises:
+        ImageError: no readable image, several bands, missing pixels, or values outside 0 to full
+            scale.
+        MachineError: an image that does not fit in memory.
+        OptionError: a full scale that pixels of this type cannot have.
     """
     pixels = read_pixels(path)
     if pixels.ndim != 2:

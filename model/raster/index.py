@@ -46,11 +46,15 @@ class _NoDoctype(ET.TreeBuilder):
 
 
 def parse_xml(content: str | bytes) -> ET.Element:
-    """Parse untrusted XML and return its root; raise ValueError, LookupError or RecursionError if
-    it is invalid.
+    """Parse untrusted XML and return its root element.
 
     With entities a file of a hundred bytes could expand to gigabytes, so a document type is
     rejected.
+
+    Raises:
+        ValueError: the text is no XML, or has a document type.
+        LookupError: the text names an encoding that Python does not know.
+        RecursionError: the elements are nested too deeply.
     """
     try:
         return ET.fromstring(content, ET.XMLParser(target=_NoDoctype()))  # noqa: S314 - without one no entities
@@ -59,16 +63,16 @@ def parse_xml(content: str | bytes) -> ET.Element:
 
 
 def read_xml(path: Path, limit_bytes: int, kind: str, advice: str) -> ET.Element:
-    """Read a file of untrusted XML, of at most `limit_bytes`, and return its root.
+    """Read a file of untrusted XML and return its root element.
 
     Args:
         path: the path of the file.
-        limit_bytes: a larger file is rejected.
+        limit_bytes: the largest accepted size of the file.
         kind: the expected kind of file, for the message.
-        advice: a sentence on what to do if it is not of that kind.
+        advice: the last sentence of the message, which says what to do.
 
     Raises:
-        ImageError: the file cannot be read as XML.
+        ImageError: the file is too large or cannot be read as XML.
     """
     try:
         return parse_xml(read_whole(path, limit_bytes))
@@ -79,20 +83,28 @@ def read_xml(path: Path, limit_bytes: int, kind: str, advice: str) -> ET.Element
 
 
 def is_index(path: Path) -> bool:
-    """Return True if the suffix is that of a file that names an image's tiles instead of containing
-    them.
+    """Return True if the suffix of a path is that of an index (VRT or DIMAP), a file that names the
+    tiles of an image instead of containing pixels.
     """
     return path.suffix.lower() in INDEX_SUFFIXES
 
 
 def index_files(path: Path, trusted: bool = False) -> tuple[Path, ...]:
-    """List the files that an index, and the indexes it names, combine into an image.
-
-    The result is empty for a file that is no index.
+    """List the files that an index (VRT or DIMAP), and the indexes that it names, combine into an
+    image.
 
     Args:
         path: the path of any image.
-        trusted: whether tiles may lie outside the index's folder; URLs are then not checked.
+        trusted: whether tiles may lie outside the index's folder; URLs are then left out of the
+            list and not checked.
+
+    Returns:
+        The resolved paths of tiles and further indexes, without `path` itself; empty if that is no
+        index.
+
+    Raises:
+        ImageError: an index cannot be read, or names a file that does not exist, is no image, or
+            lies outside its folder.
     """
     if not is_index(path):
         return ()
@@ -212,10 +224,13 @@ def _located(index: Path, text: str, folder: Path, home: Path | None) -> Path:
 
 
 def dimap_bits(path: Path) -> int | None:
-    """Read the bits per pixel of a DIMAP's product; None if it states none, or for another file.
+    """Read the number of bits per pixel that a DIMAP index states for its product.
 
     It is Dynamic_Range/PRODUCT_RANGE, otherwise Raster_Encoding/NBITS, as in Airbus' Pleiades
     Imagery User Guide.
+
+    Returns:
+        The number of bits, 1 to 16; None if the index states none, or if the file is no DIMAP.
     """
     if path.suffix.lower() != ".xml":
         return None

@@ -73,7 +73,7 @@ logging.getLogger("rasterio").addHandler(logging.NullHandler())
 
 
 def require_image_file(path: Path) -> None:
-    """Raise ImageError if a path is no file, or an empty one."""
+    """Raise ImageError if a path is no file, or is an empty file."""
     reason = unreadable(path)
     if reason is not None:
         raise ImageError(f"{printable(str(path))} cannot be read: {reason}. Check the path.")
@@ -83,7 +83,11 @@ def require_image_file(path: Path) -> None:
 
 @contextmanager
 def gdal(**options: Any) -> Iterator[None]:
-    """Configure GDAL for untrusted files, and silence its warnings."""
+    """Configure GDAL for untrusted files within the block, and silence its warnings.
+
+    Args:
+        options: further configuration options of GDAL, by their names.
+    """
     # An image need not lie anywhere on Earth, which rasterio warns about.
     with warnings.catch_warnings(action="ignore"), rasterio.Env(**ENVIRONMENT, **options):
         yield
@@ -91,18 +95,18 @@ def gdal(**options: Any) -> Iterator[None]:
 
 @contextmanager
 def open_raster(path: Path, trusted: bool = False) -> Iterator[Source]:
-    """Open an image of any size for reading by rows.
+    """Open an image of any size for reading by rows, within the block.
 
     Args:
         path: an image file, or the index of its tiles (VRT, DIMAP).
         trusted: whether an index may name files outside its folder, and URLs.
 
     Yields:
-        The image; its files include the sidecars and tiles that GDAL reads.
+        The image, whose `files` include the sidecars and tiles that GDAL reads.
 
     Raises:
         ImageError: no image, a damaged one, or one whose pixels cannot be restored.
-        MachineError: an image in strips or tiles that the memory does not hold.
+        MachineError: two rows of the image's strips or tiles do not fit in memory.
     """
     require_image_file(path)
     driver = _driver(path)
@@ -188,7 +192,12 @@ def _block_px(dataset: Any, tiles: list[Path]) -> int:
 
 @contextmanager
 def damage_in_a_sentence(path: Path, rows: str = "") -> Iterator[None]:
-    """Turn any error of GDAL about a file, or about some of its rows, into an ImageError."""
+    """Turn any error that GDAL raises within the block into an ImageError with one sentence.
+
+    Args:
+        path: the path of the image that GDAL reads.
+        rows: the part that is read, such as "rows 0 to 255", for the message; empty for the whole.
+    """
     try:
         yield
     except (BeersError, MemoryError, *CODE_FAULTS):
@@ -215,14 +224,14 @@ def damage_in_a_sentence(path: Path, rows: str = "") -> Iterator[None]:
 
 @dataclass
 class GdalSource:
-    """An image that GDAL has opened; one thread reads at a time.
+    """An image that GDAL has opened, as a `Source` of rows; one thread reads at a time.
 
     Attributes:
-        files: the files it is read from.
-        dataset: rasterio's object.
-        raster: the facts.
-        block_px: rows of the blocks in which it is decoded.
-        options: the options of GDAL.
+        files: the files that the image is read from.
+        dataset: the open image of rasterio.
+        raster: the facts of the image.
+        block_px: the number of rows of the strips or tiles that GDAL decodes as a whole.
+        options: GDAL's configuration options while it reads.
     """
 
     files: tuple[Path, ...]
@@ -232,7 +241,10 @@ class GdalSource:
     options: dict[str, str]
 
     def read(self, start: int, stop: int) -> np.ndarray:
-        """Read rows `start` to `stop` (excluded) of every band as stored, (bands, rows, width)."""
+        """Read rows `start` to `stop` (excluded) of every band as stored, (bands, rows, width).
+
+        The result is a masked array if the image has a mask or alpha.
+        """
         bands = list(range(1, self.raster.bands + 1))
         pixels = self._read(self.dataset.read, start, stop, indexes=bands)
         if not self.raster.mask_kind:
@@ -241,7 +253,9 @@ class GdalSource:
         return np.ma.MaskedArray(pixels, mask=np.broadcast_to(hidden, pixels.shape))
 
     def read_mask(self, start: int, stop: int) -> np.ndarray:
-        """Read the same rows of the mask or of alpha, (rows, width); 0 marks a missing pixel."""
+        """Read rows `start` to `stop` (excluded) of the mask or of alpha, (rows, width); 0 marks a
+        missing pixel.
+        """
         if self.raster.mask_kind == "alpha":
             return self._read(self.dataset.read, start, stop, indexes=self.raster.bands + 1)
         return self._read(self.dataset.dataset_mask, start, stop)
@@ -256,9 +270,11 @@ class GdalSource:
             return np.asarray(read_window(window=window, **options))
 
     def held_bytes(self, rows_px: int) -> int:  # noqa: ARG002
-        """Return the size of GDAL's cache: two rows of blocks.
+        """Return the bytes of GDAL's cache: two rows of the strips or tiles in which the image is
+        stored, for any `rows_px`.
 
-        Strips overlap by less than that, so no block is decoded for two of them.
+        Ranges of rows that are read one after the other overlap by less than that, so that nothing
+        is decoded twice.
         """
         raster = self.raster
         planes = raster.bands + (raster.mask_kind == "alpha")

@@ -38,17 +38,21 @@ LEVELS = {"zlib": {"ZLEVEL": 1}, "zstd": {"ZSTD_LEVEL": 1}}
 
 
 class Pixels(Protocol):
-    """The rows to write, of bands and of the mask; they may be requested more than once."""
+    """The pixels of an image to write, which the writer requests by rows, and more than once."""
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
-        """Return rows `start` to `stop` (excluded) of one band, (rows, width)."""
+        """Return rows `start` to `stop` (excluded) of one band, counted from 0: (rows, width)."""
 
     def read_mask(self, start: int, stop: int) -> np.ndarray:
-        """Return the same rows of the mask or of alpha, (rows, width)."""
+        """Return rows `start` to `stop` (excluded) of the mask or of alpha, (rows, width); 0 marks
+        a missing pixel.
+        """
 
 
 def require_codec(compression: Compression) -> None:
-    """Raise OptionError before a long run if the installed GDAL lacks a compression."""
+    """Raise OptionError if the installed GDAL lacks a compression; it is called before a long run
+    begins.
+    """
     options = {"driver": "GTiff", "width": 16, "height": 16, "count": 1, "dtype": "uint16"}
     try:
         with gdal(), MemoryFile() as memory:
@@ -73,13 +77,13 @@ def write_raster(
 
     Args:
         path: the path of the TIFF; its folder exists.
-        raster: the properties that the file states.
-        pixels: the rows to write.
+        raster: the size, the type and the metadata of the file.
+        pixels: the pixels to write.
         compression: the compression of the tiles.
-        software: the program that the file names.
+        software: the program that the file names as its origin.
 
     Raises:
-        OSError: a disk that cannot be written, or a file that differs from the given pixels.
+        OSError: the disk cannot be written, or the file differs from the given pixels.
     """
     with disk_errors(), gdal(GDAL_CACHEMAX=LEAST_CACHE_BYTES, GDAL_TIFF_INTERNAL_MASK="YES"):
         with rasterio.open(path, "w", **_profile(raster, compression)) as file:
@@ -94,13 +98,13 @@ def write_raster(
 
 
 def require_equal(path: Path, raster: Raster, pixels: Pixels) -> None:
-    """Read a written TIFF again, and raise OSError if its pixels differ from those in memory.
+    """Read a written TIFF again, and raise OSError if its pixels differ from those that were to be
+    written.
 
     Args:
         path: the path of the TIFF.
-        raster: the facts by which it was written; they tell which pixels the mask or alpha leaves
-            out.
-        pixels: the bands that were written.
+        raster: the facts with which the TIFF was written, as given to `write_raster`.
+        pixels: the pixels that were to be written.
     """
     with disk_errors(), gdal(), rasterio.open(path, driver="GTiff") as file:
         for plane, window, rows in _planes(raster, pixels):
@@ -136,7 +140,9 @@ def _planes(raster: Raster, pixels: Pixels) -> Iterator[tuple[int, Window, np.nd
 
 @contextmanager
 def disk_errors() -> Iterator[None]:
-    """Turn any error of GDAL while it writes into an OSError that states its cause."""
+    """Turn any error that GDAL raises within the block, while it writes, into an OSError that
+    states its cause.
+    """
     try:
         yield
     except Exception as error:
@@ -212,10 +218,13 @@ def write_cog(plain: Path, cog: Path, compression: Compression, about: Mapping[s
     positions (https://gdal.org/en/stable/drivers/raster/cog.html).
 
     Args:
-        plain: the TIFF; `about` is added to its metadata.
-        cog: the file to write.
+        plain: the path of the TIFF, which is changed: `about` is added to its metadata.
+        cog: the path of the file to write.
         compression: the compression of the tiles.
-        about: metadata items on the processing of the image.
+        about: metadata items on the processing of the image, from name to text.
+
+    Raises:
+        OSError: the disk cannot be read or written.
     """
     options: dict[str, Any] = {
         "COMPRESS": CODECS[compression],
@@ -236,16 +245,26 @@ def write_cog(plain: Path, cog: Path, compression: Compression, about: Mapping[s
 
 
 def padded_px(shape: tuple[int, int, int], tile_px: int = TILE_PX) -> int:
-    """Return the pixels of an image (bands, height, width) in whole tiles."""
+    """Return the number of pixels that an image takes in a file that stores whole tiles only.
+
+    Args:
+        shape: the shape (bands, height, width) of the image.
+        tile_px: the side of a tile, by default that of the TIFFs that are written here.
+    """
     bands, height, width = shape
     return bands * -(-height // tile_px) * -(-width // tile_px) * tile_px**2
 
 
 def cog_bytes(shape: tuple[int, int, int], itemsize: int) -> int:
-    """Return the maximum disk space for writing a COG of an image (bands, height, width).
+    """Return the largest disk space in bytes that writing an image as a Cloud-Optimised GeoTIFF
+    (COG) can take.
 
-    The driver halves the image until it is one block, and writes these overviews into a separate
+    The driver halves the image until it is one tile, and writes these overviews into a separate
     file first. No compression is assumed.
+
+    Args:
+        shape: the shape (bands, height, width) of the image.
+        itemsize: the number of bytes of a pixel.
     """
     bands, height, width = shape
     full = padded_px(shape, COG_TILE_PX)
@@ -259,21 +278,29 @@ def cog_bytes(shape: tuple[int, int, int], itemsize: int) -> int:
 
 @dataclass
 class ArrayPixels:
-    """Pixels in memory, (bands, H, W), none missing."""
+    """Pixels in memory, (bands, H, W), as `Pixels` to write; none of them is missing."""
 
     pixels: np.ndarray
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
-        """Return rows `start` to `stop` (excluded) of one band, (rows, width)."""
+        """Return rows `start` to `stop` (excluded) of one band, counted from 0: (rows, width)."""
         return self.pixels[band, start:stop]
 
     def read_mask(self, start: int, stop: int) -> np.ndarray:
-        """Return 255 for each pixel of the same rows, (rows, width) uint8."""
+        """Return 255, which marks no pixel as missing, for rows `start` to `stop` (excluded):
+        (rows, width) uint8.
+        """
         return np.full(self.pixels[0, start:stop].shape, 255, np.uint8)
 
 
 def write_tiff(path: Path, dn: np.ndarray) -> None:
-    """Write (H, W) uint16 as a losslessly compressed TIFF, whole or not at all."""
+    """Write an image of one band as a losslessly compressed TIFF; after an error no partial file
+    remains.
+
+    Args:
+        path: the path of the TIFF.
+        dn: digital numbers (H, W) of an integer or float type.
+    """
     height_px, width_px = dn.shape
     raster = Raster(1, height_px, width_px, dn.dtype)
     with whole_file(path) as temporary:

@@ -41,18 +41,44 @@ of the reference.
 
 
 def wiener(image: np.ndarray, blur: np.ndarray) -> np.ndarray:
-    """Apply scikit-image's Wiener filter with a Laplacian regulariser, balance 0.01."""
+    """Deconvolve an image by scikit-image's Wiener filter with a Laplacian regulariser, balance
+    0.01.
+
+    Args:
+        image: (H, W) float64, with a scale on which full scale is 1.
+        blur: the transfer function of the blur to undo on the half spectrum, (H, W // 2 + 1).
+
+    Returns:
+        The sharpened image (H, W), on the same scale.
+    """
     return np.asarray(restoration.wiener(image, blur.astype(complex), WIENER_BALANCE, clip=False))
 
 
 def unsupervised_wiener(image: np.ndarray, blur: np.ndarray) -> np.ndarray:
-    """Apply scikit-image's Wiener filter that estimates its own regularisation (seed 0)."""
+    """Deconvolve an image by scikit-image's Wiener filter that estimates its own regularisation
+    (seed 0).
+
+    Args:
+        image: (H, W) float64, with a scale on which full scale is 1.
+        blur: the transfer function of the blur to undo on the half spectrum, (H, W // 2 + 1).
+
+    Returns:
+        The sharpened image (H, W), on the same scale.
+    """
     restored, _ = restoration.unsupervised_wiener(image, blur.astype(complex), clip=False, rng=0)
     return np.asarray(restored)
 
 
 def richardson_lucy(image: np.ndarray, blur: np.ndarray) -> np.ndarray:
-    """Apply scikit-image's Richardson-Lucy deconvolution with 20 iterations."""
+    """Deconvolve an image by scikit-image's Richardson-Lucy algorithm with 20 iterations.
+
+    Args:
+        image: (H, W) float64, with a scale on which full scale is 1.
+        blur: the transfer function of the blur to undo on the half spectrum, (H, W // 2 + 1).
+
+    Returns:
+        The sharpened image (H, W), on the same scale.
+    """
     side = 2 * PAD_PX + 1
     psf = np.roll(fft.irfft2(blur, s=image.shape), (PAD_PX, PAD_PX), (0, 1))[:side, :side]
     # Richardson-Lucy is defined for kernels that are nowhere negative, and this one may ring below
@@ -66,9 +92,17 @@ def richardson_lucy(image: np.ndarray, blur: np.ndarray) -> np.ndarray:
 
 
 def nl_means(dn: Tensor, pipeline: TraditionalPipeline) -> Tensor:
-    """Run the pipeline with scikit-image's non-local means, and return (H, W) DN.
+    """Restore an image by the traditional pipeline with scikit-image's non-local means in place of
+    NL-Bayes.
 
     It uses 5 x 5 patches within 6 pixels and h = 0.6 sigma.
+
+    Args:
+        dn: digital numbers (H, W) of the degraded sensor.
+        pipeline: the two sensors; an epsilon is derived from the image if it has none.
+
+    Returns:
+        Digital numbers (H, W) of the reference.
     """
     sensor = with_rounding_noise(pipeline.degraded)
     stable = stabilise(to_radiance(dn, pipeline.degraded), sensor)

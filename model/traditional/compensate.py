@@ -30,14 +30,19 @@ BLOCK_PX = 384
 
 
 def filter_strips(strips: Iterable[Tensor], height: int, kernel: Tensor) -> Iterator[Tensor]:
-    """Filter an image (H, W) that arrives in strips (any, W) with a kernel (K, K).
+    """Filter an image that arrives in strips of rows.
 
     Unit and mean are preserved, and borders are mirrored. Blocks lie on a grid of their own, so
     that the result does not depend on the input strips, bit for bit. NaN pixels are filled from
     their neighbours first, and are NaN again in the result.
 
+    Args:
+        strips: the rows of the image (H, W) from top to bottom, in strips (any, W).
+        height: the number of rows H of the image.
+        kernel: the filter (K, K), K odd, whose sum is 1.
+
     Yields:
-        Strips of BLOCK_PX rows.
+        The filtered image in strips of BLOCK_PX rows; the last strip may have fewer.
     """
     # The grid of blocks is fixed from row 0: the result may not depend on how the strips were cut.
     rows = Rows(strips)
@@ -73,15 +78,22 @@ def _block(rows: Tensor, kernel: Tensor, left: int) -> Tensor:
 
 
 def compensation_kernel(blur_from: Blur, blur_to: Blur, epsilon: float) -> Tensor:
-    """Compute the filter with the gain `compensation_gain`, cut at RADIUS_PX: (2 R + 1, 2 R + 1)
-    float64, sum 1.
+    """Compute a filter that converts an image with one blur to an image with another.
 
-    The gain is exact at DC and at frequencies above some cycles per 2 R pixels.
+    It has the gain `compensation_gain`, cut at RADIUS_PX. The gain is exact at DC and at
+    frequencies above some cycles per 2 R pixels.
 
     Args:
-        blur_from: blur of the image, as in `compensation_gain`.
+        blur_from: the blur of the image: its MTF at Nyquist or its complete response, as in
+            `compensation_gain`.
         blur_to: the blur to reach, likewise.
-        epsilon: regularisation, 0 or more.
+        epsilon: strength of the regularisation, 0 or more; a larger one sharpens less.
+
+    Returns:
+        The filter (2 R + 1, 2 R + 1) float64, with the sum 1 and R = RADIUS_PX.
+
+    Raises:
+        OptionError: epsilon is negative or not finite.
     """
     # Sampled this finely, the slow tail folds back onto the filter little.
     side = 8 * RADIUS_PX
@@ -92,21 +104,27 @@ def compensation_kernel(blur_from: Blur, blur_to: Blur, epsilon: float) -> Tenso
 def compensation_gain(
     height: int, width: int, blur_from: Blur, blur_to: Blur, epsilon: float
 ) -> NDArray[np.inexact]:
-    """Compute G = T H* / (|H|^2 + epsilon r^2) on the half spectrum, (height, width // 2 + 1)
-    float64.
+    """Compute G = T H* / (|H|^2 + epsilon r^2), the gain that converts one blur to another, at each
+    frequency.
 
-    It is complex128 if H or T is that of a point-spread function; H* is the conjugate of H. H is
-    the MTF to compensate, T the one to reach, r = |f| / f_Nyquist. Limits: epsilon = 0 gives T / H,
-    with up to 20 times the noise at the corner of the spectrum for 3 to 25 %; a large epsilon
-    blurs.
+    H is the MTF to compensate, H* its conjugate, T the MTF to reach, r = |f| / f_Nyquist. Limits:
+    epsilon = 0 gives T / H, with up to 20 times the noise at the corner of the spectrum for 3 to 25
+    %; a large epsilon blurs.
 
     Args:
-        height: rows of the image.
-        width: columns of the image.
-        blur_from: MTF at Nyquist of the image, in (0, 2 / pi], one, or across and along the track;
-            or its response.
-        blur_to: the MTF to reach, likewise.
-        epsilon: regularisation, 0 or more.
+        height: the number of rows of the image.
+        width: the number of columns of the image.
+        blur_from: the blur of the image: its MTF at Nyquist in (0, 2 / pi], one number or those
+            across and along the track; or its complete response.
+        blur_to: the blur to reach, likewise.
+        epsilon: strength of the regularisation, 0 or more.
+
+    Returns:
+        The gain on the half spectrum, (height, width // 2 + 1) float64; complex128 if H or T is
+        that of a point-spread function.
+
+    Raises:
+        OptionError: epsilon is negative or not finite.
     """
     if not 0 <= epsilon < float("inf"):
         raise OptionError(

@@ -29,13 +29,23 @@ from beers_deploy.profiles.errors import ImageError
 
 
 def patch_matrix(image: Tensor, side_px: int) -> Tensor:
-    """Return every patch of (H, W) as a row: ((H - k + 1) * (W - k + 1), k * k)."""
+    """Return every patch of an image as a row of a matrix: ((H - k + 1) * (W - k + 1), k * k).
+
+    Args:
+        image: (H, W).
+        side_px: k, the side of a patch.
+    """
     return image.unfold(0, side_px, 1).unfold(1, side_px, 1).reshape(-1, side_px * side_px)
 
 
 def overlap_add(patches: Tensor, shape: torch.Size, side_px: int) -> Tensor:
-    """Add every patch of the matrix at its place in an image of `shape` (H, W): the adjoint of
-    `patch_matrix`.
+    """Add every patch at its place in an image of zeros, so that overlapping patches add up: the
+    adjoint of `patch_matrix`.
+
+    Args:
+        patches: ((H - k + 1) * (W - k + 1), k * k), in the order of `patch_matrix`.
+        shape: the shape (H, W) of the image.
+        side_px: k, the side of a patch.
     """
     height, width = shape
     stack = patches.reshape(height - side_px + 1, width - side_px + 1, side_px, side_px)
@@ -49,15 +59,17 @@ def overlap_add(patches: Tensor, shape: torch.Size, side_px: int) -> Tensor:
 def window_distances(
     guide: Tensor, rows: Tensor, columns: Tensor, side_px: int, window_px: int
 ) -> Tensor:
-    """Compute the squared L2 distance of each reference patch to the window_px^2 patches around it.
+    """Compute the squared L2 distance of each reference patch to the window_px^2 candidate patches
+    around it.
 
     d(p, q) = sum over k * k pixels of (P - Q)^2, as box sums of shifted differences. They are
     exact, whereas the expansion |P|^2 - 2 P.Q + |Q|^2 would cancel in float32.
 
     Args:
-        guide: (H, W), wide enough to hold every window.
-        rows: (R,) top row of each reference's window, ascending from 0.
-        columns: (C,) leftmost column of it, ascending from 0.
+        guide: the image (H, W) to compare patches in, wide enough to hold every window.
+        rows: (R,) top row of each reference's search window, ascending from 0.
+        columns: (C,) leftmost column of each window, ascending from 0. Each of the R rows is
+            combined with each of the C columns.
         side_px: k, the side of a patch.
         window_px: number of candidates along each axis, odd; the reference is the middle one.
 
@@ -87,17 +99,18 @@ def window_distances(
 def window_numbers(
     rows: Tensor, columns: Tensor, grid_columns: int, window_px: int
 ) -> tuple[Tensor, Tensor]:
-    """Compute the patch numbers of the candidates in each window.
+    """Compute the numbers of the candidate patches in each search window, which are row numbers of
+    `patch_matrix`.
 
     Args:
         rows: (R,) top row of each reference's window.
-        columns: (C,) leftmost column of it.
+        columns: (C,) leftmost column of each window.
         grid_columns: the number of patches in a row of the image.
         window_px: the number of candidates along each axis.
 
     Returns:
         The number of each window's first candidate (R * C, 1), and the offsets of all candidates
-        (window_px^2,).
+        from it (window_px^2,).
     """
     first = (rows[:, None] * grid_columns + columns).reshape(-1, 1)
     steps = torch.arange(window_px, device=rows.device)
@@ -128,17 +141,21 @@ Places = tuple[Tensor, Tensor]
 def denoise_pass(
     noisy: Rows, guide: Rows, height: int, noise: Noise, settings: PassSettings, stride_px: int
 ) -> Iterator[Tensor]:
-    """Average all estimates of each pixel, and yield the result in strips (any, W).
+    """Run one of the two passes of NL-Bayes: average all estimates of each pixel.
 
     A pixel without any estimate keeps its value.
 
     Args:
         noisy: rows of the noisy image.
-        guide: rows of the image in which similar patches are searched.
-        height: the number of rows.
+        guide: rows of the image in which similar patches are searched: in pass 1 the noisy image,
+            in pass 2 the result of pass 1.
+        height: the number of rows of either image.
         noise: the noise to remove.
-        settings: the settings of the pass.
-        stride_px: distance of neighbouring references.
+        settings: the parameters of the pass.
+        stride_px: distance in pixels of neighbouring reference patches.
+
+    Yields:
+        The result in strips (any, W), from top to bottom.
     """
     margin = settings.margin_px
     runs = reference_runs(height, stride_px)
@@ -161,9 +178,17 @@ def denoise_pass(
 
 
 def reference_runs(size_px: int, stride_px: int) -> tuple[Tensor, ...]:
-    """Return the centres of the references along one axis, (n,) per tile.
+    """Place the reference patches along one axis of an image, and divide them into tiles that are
+    computed at once.
 
     The last pixel always has a reference.
+
+    Args:
+        size_px: the number of pixels along the axis.
+        stride_px: distance in pixels of neighbouring references.
+
+    Returns:
+        The pixel numbers of the centres of the references, (n,) per tile.
     """
     centres = torch.arange(0, size_px + stride_px - 1, stride_px).clamp(max=size_px - 1)
     return torch.split(centres, TILE_REFERENCES)
@@ -240,7 +265,7 @@ def _rows_of(matrix: Tensor, numbers: Tensor) -> Tensor:
 def similar_groups(
     guide: Tensor, valid: Tensor, places: Places, settings: PassSettings
 ) -> Iterator[tuple[Tensor, Tensor | None]]:
-    """Yield groups of similar patches.
+    """Yield groups of similar patches, one group around each reference patch.
 
     The many groups of at most the usual size come first, so that they do not need the memory of the
     larger groups.
@@ -248,11 +273,12 @@ def similar_groups(
     Args:
         guide: (h, w), in which similar patches are searched.
         valid: (h, w) bool, False where a pixel is missing.
-        places: rows and columns of the search windows.
-        settings: the settings of the pass.
+        places: rows and columns of the search windows of the references, as in `window_distances`.
+        settings: the parameters of the pass.
 
     Yields:
-        The patch numbers (B, N) of groups, and a mask of those that count (None: all).
+        The patch numbers (B, N) of B groups, and a mask (B, N) of 0 and 1 that is 1 for the patches
+        that belong to their group; None if all do.
     """
     distances = window_distances(guide.nan_to_num(0), *places, settings.side_px, settings.window_px)
     first, steps = window_numbers(
@@ -285,14 +311,17 @@ def _rule_out(distances: Tensor, numbers: Tensor, complete: Tensor) -> None:
 
 
 def nearest_first(distances: Tensor, usual: int, most: int) -> tuple[Tensor, Tensor]:
-    """Return the columns (B, most) of the smallest values of each row, and these values.
+    """Find the smallest distances in each row.
 
     numpy's partition is over three times faster than torch's topk (measured).
 
     Args:
-        distances: (B, M).
-        usual: this number of smallest values comes first.
-        most: the number of columns to return.
+        distances: (B, M), the distances of M candidates to each of B references.
+        usual: this number of smallest values comes first, in any order.
+        most: the number of smallest values to return, at most M.
+
+    Returns:
+        The columns (B, most) of the smallest values of each row, and these values.
     """
     ends = [k for k in (usual - 1, most - 1) if k < distances.shape[1] - 1]
     if ends:
@@ -305,8 +334,8 @@ def nearest_first(distances: Tensor, usual: int, most: int) -> tuple[Tensor, Ten
 def nl_bayes_strips(
     strips: Iterable[Tensor], height: int, noise: Noise, quality: Quality
 ) -> Iterator[Tensor]:
-    """Remove Gaussian noise from an image that arrives in strips of rows, and yield strips, (any,
-    W) float32 each.
+    """Remove Gaussian noise from an image that arrives in strips of rows, by both passes of
+    NL-Bayes.
 
     NaN marks missing pixels; they remain missing, and affect no other pixel. The settings were
     published for 8-bit images: scale the data such that sigma lies within some 5 to 40. Limits: a
@@ -315,10 +344,16 @@ def nl_bayes_strips(
     strips are cut. Some 150 rows, and the tallest strip, are held in memory.
 
     Args:
-        strips: the strips of the image.
-        height: the number of rows of all strips.
-        noise: to remove.
-        quality: density of the references and size of the groups.
+        strips: the rows of the image (H, W) from top to bottom, in strips (any, W).
+        height: the number of rows H of the image.
+        noise: the noise to remove, in the unit of the image.
+        quality: density of the reference patches and size of their groups.
+
+    Yields:
+        The denoised image in strips (any, W) float32.
+
+    Raises:
+        ImageError: a pixel is infinite.
     """
     # The second pass reads the noisy rows again, behind the first: tee keeps those between.
     as_guide, for_first, for_second = tee(finite_or_missing(strips), 3)
@@ -332,7 +367,10 @@ def nl_bayes_strips(
 
 
 def finite_or_missing(strips: Iterable[Tensor]) -> Iterator[Tensor]:
-    """Pass strips (any, W) on as they come; NaN marks missing pixels."""
+    """Yield the strips (any, W) of an image unchanged, or raise ImageError if a pixel is infinite.
+
+    NaN marks missing pixels and is accepted.
+    """
     for strip in strips:
         if bool(torch.isinf(strip).any()):
             raise ImageError(

@@ -14,20 +14,24 @@ LAG_PX = 6
 
 @dataclass(frozen=True)
 class Noise:
-    """Stationary Gaussian noise of an image: the standard deviation of a pixel, and the correlation
-    of two pixels (None if white).
+    """Stationary Gaussian noise of an image.
 
-    The correlation is indexed by the lag (dy + L, dx + L), (2 L + 1, 2 L + 1), with L at least a
-    patch's side minus one.
+    Attributes:
+        sigma: the standard deviation of a pixel, in the unit of the image.
+        correlation: the correlation of two pixels by the lag (dy + L, dx + L) between them, (2 L +
+            1, 2 L + 1) with L at least a patch's side minus one; None for white noise.
     """
 
     sigma: float
     correlation: Tensor | None = None
 
     def covariance(self, side_px: int) -> Tensor:
-        """Return the covariance of the pixels of a patch of side k, (k * k, k * k) float64.
+        """Return the covariance of the noise of the pixels of a patch, (k * k, k * k) float64.
 
         It is in the unit of the image squared.
+
+        Args:
+            side_px: k, the side of the patch.
         """
         if self.correlation is None:
             return torch.eye(side_px**2, dtype=torch.float64) * self.sigma**2
@@ -40,11 +44,14 @@ class Noise:
 
 
 def coloured_by(kernel: Tensor, sigma: float) -> Noise:
-    """Return the noise that filtering white noise of standard deviation `sigma` by `kernel` (K, K)
-    gives; K is odd.
+    """Return the noise that results from filtering white noise.
 
     Its correlation is the autocorrelation of the kernel, r(d) = sum over p of k(p) k(p + d), over
     r(0). Its standard deviation is sigma times the root of r(0).
+
+    Args:
+        kernel: the filter (K, K), K odd.
+        sigma: the standard deviation of the white noise.
     """
     # So large that no lag wraps around.
     size = kernel.shape[-1] + 2 * LAG_PX
@@ -56,18 +63,25 @@ def coloured_by(kernel: Tensor, sigma: float) -> Noise:
 
 
 def with_rounding_noise(sensor: Instrument) -> Instrument:
-    """Return the sensor with the 1/12 DN^2 of its converter's rounding added to beta."""
+    """Return the sensor with 1/12 DN^2, the variance that rounding to whole digital numbers adds,
+    included in its beta.
+    """
     return replace(sensor, beta=sensor.beta + 1 / (12 * sensor.gain_dn_per_radiance**2))
 
 
 def stabilise(radiance: Tensor, sensor: Instrument) -> Tensor:
-    """Compute f(L) = 2 L / (sqrt(alpha L + beta) + sqrt(beta)), which equals 2 (sqrt(alpha L +
-    beta) - sqrt(beta)) / alpha.
+    """Convert radiance to a scale on which the noise of a sensor has variance 1 at every
+    brightness.
 
-    The first form avoids the difference, which vanishes in float32 for small alpha. f is monotone,
-    with f' = 1 / sigma(L). Limits: alpha = 0 gives L / sqrt(beta); beta = 0 gives 2 sqrt(L /
-    alpha). Below L = 0 the noise is that of the dark, and f continues as L / sqrt(beta) (as 0 if
-    beta = 0). L has any shape and is in W/m2/sr/um; alpha and beta are at least 0 and not both 0.
+    f(L) = 2 L / (sqrt(alpha L + beta) + sqrt(beta)), which equals 2 (sqrt(alpha L + beta) -
+    sqrt(beta)) / alpha. The first form avoids the difference, which vanishes in float32 for small
+    alpha. f is monotone, with f' = 1 / sigma(L). Limits: alpha = 0 gives L / sqrt(beta); beta = 0
+    gives 2 sqrt(L / alpha). Below L = 0 the noise is that of the dark, and f continues as L /
+    sqrt(beta) (as 0 if beta = 0).
+
+    Args:
+        radiance: L in W/m2/sr/um, any shape.
+        sensor: the instrument whose alpha and beta are used, at least 0 and not both 0.
     """
     sigma_dark = math.sqrt(sensor.beta)
     # Without the difference of two roots, which vanishes in float32 for small alpha.
@@ -77,16 +91,22 @@ def stabilise(radiance: Tensor, sensor: Instrument) -> Tensor:
 
 
 def destabilise(stable: Tensor, sensor: Instrument) -> Tensor:
-    """Compute L = t sqrt(beta) + alpha t^2 / 4, any shape: the inverse of `stabilise`.
+    """Convert values on the scale of `stabilise` back to radiance in W/m2/sr/um: L = t sqrt(beta) +
+    alpha t^2 / 4.
 
     Below t = 0 it is t sqrt(beta). The mean of noisy values t lies below f(mean L), because f is
     concave: see `bias_radiance`.
+
+    Args:
+        stable: t, any shape.
+        sensor: the instrument that was given to `stabilise`.
     """
     return stable * math.sqrt(sensor.beta) + sensor.alpha / 4 * stable.clamp(min=0).square()
 
 
 def bias_radiance(sensor: Instrument) -> float:
-    """Return the bias of averaging on the stabilised scale: alpha / 4, in W/m2/sr/um.
+    """Return the radiance to add after averaging noisy values on the stabilised scale: alpha / 4,
+    in W/m2/sr/um.
 
     To second order E[f(L + n)] = f(L) + f''(L) var / 2 = f(L) - alpha / (4 sigma(L)), and L moves
     by sigma(L) times that. It is exact to higher order only if sigma(L) is small compared with L +

@@ -27,11 +27,15 @@ area criterion).
 
 @dataclass(frozen=True)
 class Quality:
-    """The density of the references, and the largest size of a group of pass 2.
+    """A compromise between time and quality of NL-Bayes.
 
-    `stride_px` is the distance of neighbouring references; `group_cap` is in multiples of the usual
-    group. The published method has no cap, and visits every second pixel unless an earlier group
-    contained it.
+    The published method has no limit on groups, and visits every second pixel unless an earlier
+    group contained it.
+
+    Attributes:
+        stride_px: the distance in pixels of neighbouring reference patches; a smaller one takes
+            longer.
+        group_cap: the largest size of a group in pass 2, in multiples of the usual size.
     """
 
     stride_px: int
@@ -47,8 +51,9 @@ class PassSettings:
 
     Attributes:
         side_px: k, the side of a patch.
-        similar: N, the number of patches of a group.
-        most_similar: the largest group, where more than N patches differ by less than ALIKE_RMS.
+        similar: N, the usual number of patches of a group.
+        most_similar: the largest number of patches of a group, which is reached where more than N
+            patches differ by less than ALIKE_RMS.
         excess: beta, the factor on the noise variance.
         clean_guide: True in pass 2, in which the guide's covariance is that of the signal alone,
             without noise.
@@ -69,14 +74,16 @@ class PassSettings:
 
     @property
     def margin_px(self) -> int:
-        """The number of pixels beyond the border that a reference centred on a border
-        pixel needs.
+        """The number of pixels beyond the border that the search around a reference patch centred
+        on a border pixel needs.
         """
         return self.window_px // 2 + self.side_px // 2
 
 
 def first_pass(sigma: float) -> PassSettings:
-    """Pass 1: the noisy image is its own guide."""
+    """Return the published parameters of pass 1, in which the noisy image is its own guide, for
+    noise of standard deviation `sigma`.
+    """
     side_px = 5 if sigma < 30 else 7
     similar = _below(sigma, {10: 35, 30: 45, 80: 90}, 100)
     excess = _below(sigma, {15: 1.1, 70: 1.0}, 0.9)
@@ -84,7 +91,12 @@ def first_pass(sigma: float) -> PassSettings:
 
 
 def second_pass(sigma: float, quality: Quality) -> PassSettings:
-    """Pass 2: the result of pass 1 is the guide."""
+    """Return the published parameters of pass 2, in which the result of pass 1 is the guide.
+
+    Args:
+        sigma: the standard deviation of the noise.
+        quality: its `group_cap` limits the size of a group, which the published method does not.
+    """
     similar = _below(sigma, {20: 15, 40: 25, 80: 30}, 45)
     excess = _below(sigma, {15: 1.1, 35: 1.0}, 0.9)
     return PassSettings(5, similar, quality.group_cap * similar, excess, clean_guide=True)
@@ -119,11 +131,15 @@ def estimate_groups(
 
     Args:
         noisy: (B, N, k * k) groups of patches.
-        guide: the same patches of the guide image; in pass 1 `noisy` itself.
-        mask: (B, N) of 0 and 1: which patches belong to the group, None for all; estimates of the
-            others are meaningless.
+        guide: the same patches of the guide image, in which similarity was measured; in pass 1
+            `noisy` itself.
+        mask: (B, N), 1 for the patches that belong to their group and 0 for others, whose estimates
+            are meaningless; None if all belong to it.
         noise: the noise of `noisy`.
-        settings: those of the pass.
+        settings: the parameters of the pass.
+
+    Returns:
+        The estimates of all patches, (B, N, k * k).
     """
     mean, centred, covariance = _moments(noisy, mask)
     if guide is not noisy:

@@ -43,18 +43,19 @@ Order = Literal["denoise-first", "deconvolve-first"]
 
 @dataclass(frozen=True)
 class TraditionalPipeline:
-    """The parameters of a traditional restoration.
+    """The parameters of a traditional restoration: denoising by NL-Bayes and MTF compensation,
+    without a network.
 
-    It restores images of `degraded` to those that `reference` would have acquired without its
+    It converts images of `degraded` to those that `reference` would have acquired without its
     noise.
 
     Attributes:
         degraded: the instrument that acquired the images.
         reference: the instrument that the restoration aims at.
-        quality: one of `patch_groups.QUALITIES`.
-        order: which of denoising and MTF compensation comes first.
-        epsilon: regularises the MTF compensation. None derives it from each image: by
-            `restore_traditional`, or by `fitted_to` for an image in strips.
+        quality: "fast", "standard" or "best", a compromise between time and quality of NL-Bayes.
+        order: whether denoising or MTF compensation, a deconvolution, comes first.
+        epsilon: strength of the regularisation of the MTF compensation. None derives it from each
+            image: by `restore_traditional`, or by `fitted_to` for an image in strips.
     """
 
     degraded: Instrument
@@ -64,12 +65,15 @@ class TraditionalPipeline:
     epsilon: float | None = None
 
     def fitted_to(self, strips: Iterable[Tensor]) -> "TraditionalPipeline":
-        """Return the pipeline with the epsilon of an image.
+        """Return the pipeline with the epsilon that suits the noise and the contrast of an image.
 
         A pipeline that has an epsilon is returned unchanged, and no strip is read.
 
         Args:
             strips: the image as strips (rows, W) of digital numbers, NaN where missing.
+
+        Raises:
+            ImageError: a pixel is infinite.
         """
         if self.epsilon is not None:
             return self
@@ -94,6 +98,15 @@ def restore_traditional(dn: Tensor, pipeline: TraditionalPipeline) -> Tensor:
     """Restore digital numbers (H, W) float32 of the degraded sensor to those of the reference.
 
     The result is clipped and not rounded. NaN marks missing pixels, and remains.
+
+    Args:
+        dn: the digital numbers of the image.
+        pipeline: the two sensors and the parameters; an epsilon is derived from the image if it has
+            none.
+
+    Raises:
+        ImageError: a pixel is infinite.
+        OptionError: the pipeline has an unknown quality or an invalid epsilon.
     """
     return torch.cat(list(restore_strips([dn], dn.shape[0], pipeline.fitted_to([dn]))))
 
@@ -101,14 +114,24 @@ def restore_traditional(dn: Tensor, pipeline: TraditionalPipeline) -> Tensor:
 def restore_strips(
     strips: Iterable[Tensor], height: int, pipeline: TraditionalPipeline
 ) -> Iterator[Tensor]:
-    """Restore an image that arrives in strips of rows, (any, W) each, with the same bits as
-    `restore_traditional`.
+    """Restore an image that arrives in strips of rows, with the same bits as `restore_traditional`.
 
     The strips are read only once. Some 700 rows of the image, and the tallest strip, are held in
     memory.
 
+    Args:
+        strips: digital numbers of the degraded sensor from top to bottom, in strips (any, W); NaN
+            where missing.
+        height: the number of rows of all strips.
+        pipeline: the two sensors and the parameters, with an epsilon.
+
+    Yields:
+        Digital numbers of the reference, in strips (any, W).
+
     Raises:
-        OptionError: the pipeline has no epsilon. `TraditionalPipeline.fitted_to` derives it.
+        ImageError: a pixel is infinite.
+        OptionError: the pipeline has no epsilon, which `TraditionalPipeline.fitted_to` derives, or
+            an invalid parameter.
     """
     radiance = (to_radiance(strip, pipeline.degraded) for strip in finite_or_missing(strips))
     # The converter's rounding adds a twelfth of a squared DN, which NL-Bayes must know of.
@@ -135,15 +158,19 @@ def restore_strips(
 def denoise_radiance(
     radiance: Iterable[Tensor], height: int, sensor: Instrument, noise: Noise, quality: Quality
 ) -> Iterator[Tensor]:
-    """Denoise strips (any, W) in W/m2/sr/um with NL-Bayes on the stabilised scale, and yield
-    strips.
+    """Denoise an image in radiance with NL-Bayes, on the scale of `stabilise` on which the noise is
+    equal everywhere.
 
     Args:
-        radiance: strips with noise of the variance alpha L + beta.
+        radiance: strips (any, W) in W/m2/sr/um with noise of the variance alpha L + beta.
         height: the number of rows of all strips.
-        sensor: its alpha and beta.
-        noise: on the stabilised scale.
-        quality: density of the references and size of the groups.
+        sensor: the instrument that states alpha and beta.
+        noise: the noise that NL-Bayes removes. The stabilised image, whose noise is 1, is
+            multiplied by its sigma first.
+        quality: density of the reference patches and size of their groups.
+
+    Yields:
+        The denoised image in strips (any, W) in W/m2/sr/um.
     """
     scale = noise.sigma
     stable = (stabilise(strip, sensor) * scale for strip in radiance)
@@ -153,7 +180,9 @@ def denoise_radiance(
 
 
 def quality_named(name: str) -> Quality:
-    """Return the quality of a name, or raise OptionError."""
+    """Return the quality called "fast", "standard" or "best", or raise OptionError for another
+    name.
+    """
     if name not in QUALITIES:
         raise OptionError(f"`quality` must be one of {', '.join(QUALITIES)}, got {name!r}.")
     return QUALITIES[name]

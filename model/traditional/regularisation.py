@@ -76,13 +76,15 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class NoiseAndScene:
-    """Means over the known pixels of an image, in (W/m2/sr/um)^2 unless stated otherwise.
+    """The power of the noise and of the scene in an image, from which epsilon is derived.
+
+    Each attribute is a mean over the known pixels, in (W/m2/sr/um)^2 unless stated otherwise.
 
     Attributes:
         radiance: the mean radiance L in W/m2/sr/um, at least 0.
         noise: variance of the noise, v.
-        residual: the part of the noise that denoising is expected to leave, v u / (u + 1), where
-            u = g / (2 v) - 1, at least 0, is the scene over the noise.
+        residual: the part of the noise that denoising is expected to leave, v u / (u + 1), where u
+            = g / (2 v) - 1, at least 0, is the scene over the noise.
         contrast: the mean squared difference of neighbours, g, less that of the noise, 2 v; may be
             negative.
     """
@@ -102,7 +104,9 @@ class NoiseAndScene:
 
     @property
     def largest_epsilon(self) -> float:
-        """Return the bound of epsilon that the noise sets."""
+        """The largest epsilon that does not erase faint patterns; it is larger for an image with
+        more noise.
+        """
         sigma = self.noise**0.5
         # Compared as products, because the radiance of the dark is 0.
         if LARGEST_EPSILON * self.radiance <= LARGEST_PER_NOISE * sigma:
@@ -111,15 +115,18 @@ class NoiseAndScene:
 
 
 def measure(strips: Iterable[Tensor], sensor: Instrument) -> NoiseAndScene:
-    """Measure noise and contrast of an image in strips (any, W) of digital numbers, NaN where they
-    are missing.
+    """Measure the noise and the contrast of an image.
 
     Missing pixels do not count, and neither do blocks whose known pixels are all saturated. A
     single saturated pixel counts, because epsilon would otherwise jump when a bright point begins
     to saturate.
 
     The result does not depend, to the last bit, on how the strips are cut. The image is measured in
-    bands of rows on a grid of its own, and the sums of the bands are added in order.
+    bands of 4 rows on a grid of its own, and the sums of the bands are added in order.
+
+    Args:
+        strips: digital numbers in strips (any, W), NaN where they are missing.
+        sensor: the instrument that acquired the image.
     """
     digitised = with_rounding_noise(sensor)
     sums = np.zeros(4)
@@ -138,12 +145,20 @@ def measure(strips: Iterable[Tensor], sensor: Instrument) -> NoiseAndScene:
 
 
 def derived_epsilon(measured: NoiseAndScene, sensor: Instrument) -> float:
-    """Return epsilon = a (N / S)^p, above 0 and within its bounds."""
+    """Return the strength of the regularisation that suits an image: epsilon = a (N / S)^p, above 0
+    and at most `largest_epsilon`.
+
+    Args:
+        measured: the noise and the contrast of the image.
+        sensor: the instrument that acquired the image.
+    """
     return float(min(SCALE * measured.ratio(sensor) ** POWER, measured.largest_epsilon))
 
 
 def bands(strips: Iterable[Tensor]) -> Iterator[Tensor]:
-    """Yield the rows of strips (any, W) in bands of BLOCK_PX rows; the last band may have fewer."""
+    """Yield the rows of an image that arrives in strips (any, W) in bands of BLOCK_PX rows; the
+    last band may have fewer.
+    """
     remainder: Tensor | None = None
     for strip in strips:
         rows = strip if remainder is None else torch.cat([remainder, strip])
@@ -207,9 +222,11 @@ def _blocks(values: Array) -> tuple[Array, Array]:
 
 
 def difference_energy(sensor: Instrument) -> float:
-    """Return c, the mean squared difference of neighbours in the image of a scene of power 1 / r^2.
+    """Return c, the mean squared difference of neighbouring pixels in an image of a scene whose
+    power is 1 / r^2.
 
-    Frequency 0 does not count: the mean of an image is no contrast.
+    r is the frequency over Nyquist. Frequency 0 does not count: the mean of an image is no
+    contrast.
     """
     fy = np.fft.fftfreq(GRID)[:, None]
     fx = np.fft.fftfreq(GRID)[None, :]

@@ -11,7 +11,9 @@ from torch.nn.functional import pad
 
 
 class Rows:
-    """The rows of an image that arrive strip by strip; rows above the last window are discarded."""
+    """An image that arrives in strips of rows; rows are held only until a window below them is
+    requested.
+    """
 
     def __init__(self, strips: Iterable[Tensor]) -> None:
         self._strips: Iterator[Tensor] = iter(strips)
@@ -19,7 +21,12 @@ class Rows:
         self._top = 0
 
     def window(self, rows: Tensor) -> Tensor:
-        """Return the rows with the numbers (R,) as (R, W); windows must move downwards."""
+        """Return some rows of the image as (R, W), reading strips until all are there.
+
+        Args:
+            rows: (R,) row numbers, in any order and repeated if needed. The smallest may not lie
+                above that of an earlier call.
+        """
         top = int(rows.min())
         bottom = int(rows.max()) + 1
         while self._top + sum(map(len, self._in_memory)) < bottom:
@@ -32,10 +39,18 @@ class Rows:
 
 
 def mirrored(start: int, stop: int, size: int) -> Tensor:
-    """Return pixel numbers (stop - start,) of an image mirrored at its borders, the edge repeated:
-    c b a | a b c | c b a.
+    """Return the numbers of the pixels start..stop - 1 of an axis that is mirrored at its borders,
+    the edge repeated: c b a | a b c | c b a.
 
     They are folded back into 0..size - 1, because the mirror has the period 2 * size.
+
+    Args:
+        start: the first position; it may be negative.
+        stop: the position after the last one; it may exceed `size`.
+        size: the number of pixels along the axis.
+
+    Returns:
+        Pixel numbers (stop - start,).
     """
     number = torch.arange(start, stop) % (2 * size)
     return torch.minimum(number, 2 * size - 1 - number)
@@ -59,7 +74,9 @@ def map_tiles(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator
 
 @contextmanager
 def one_thread_per_operation() -> Iterator[int]:
-    """Limit torch to one thread per operation within the block, and yield the previous number."""
+    """Limit torch to one thread per operation within the block, and yield the number of threads it
+    had before.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -69,12 +86,15 @@ def one_thread_per_operation() -> Iterator[int]:
 
 
 def fill_with_local_means(image: Tensor, valid: Tensor) -> Tensor:
-    """Fill the pixels of (H, W) that are not `valid` with the mean of the nearest valid ones
-    around.
+    """Fill missing pixels with the mean of the nearest valid ones around.
 
     It uses a pyramid: each level fills its missing pixels from the next, of half the resolution.
     The value is 0 if no pixel is valid. scikit-image's biharmonic inpainting gives other values, by
     up to 117 of 255 in a striped photograph (measured).
+
+    Args:
+        image: (H, W); the values of missing pixels do not matter.
+        valid: (H, W) bool, False for the pixels to fill.
     """
     filled = image.where(valid, 0.0)
     if bool(valid.all()) or max(image.shape) == 1:
