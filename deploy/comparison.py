@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from beers_deploy.conditioned_file import conditioned_on
 from beers_deploy.model.io.files import IMAGE_SUFFIXES, sha256
 from beers_deploy.model.progress import Progress, reporting
 from beers_deploy.model.raster.images import list_images
@@ -302,8 +303,10 @@ def compared(
     with faults_named(floating.label):
         float_session = open_any_size(floating.model)
     with faults_named(int8.label):
-        result = differences_of(float_session, open_any_size(int8.model), patches, metric)
-        shares = saturated_shares(int8.model, patches.degraded)
+        # A file for every sensor is compared under the sensor that the float network has.
+        runs = int8 if floating.weights is None else conditioned_on(int8, data.sensor)
+        result = differences_of(float_session, open_any_size(runs.model), patches, metric)
+        shares = saturated_shares(runs.model, patches.degraded)
     rests_on = [sensor_input(data.sensor), *data.inputs]
     # Samples in memory are no file, so the digest is that of their values.
     if data.arguments["samples"] == IN_MEMORY:

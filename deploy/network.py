@@ -19,6 +19,7 @@ from beers_deploy.model.exposure import brightened, factors_for
 from beers_deploy.model.shipped import INT8, SENSOR, VARIANT, shipped_names
 from beers_deploy.network_files import (
     Conditioned,
+    ConditionedFile,
     conditioned,
     require_known,
     warn_outside,
@@ -95,7 +96,7 @@ class Network:
     layers: tuple[Row, ...] = ()
     quantized: "Quantized | None" = None
     file_sha256: str = ""
-    weights: Conditioned | None = None
+    weights: Conditioned | ConditionedFile | None = None
     profile: Sensor | None = None
     table: "Table | None" = None
 
@@ -152,12 +153,14 @@ class Network:
         return cls(exported(network, example), type(network).__name__)
 
     @classmethod
-    def for_sensor(cls, weights: Conditioned, sensor: Sensor, *, int8: bool) -> "Network":
+    def for_sensor(
+        cls, weights: Conditioned | ConditionedFile, sensor: Sensor, *, int8: bool
+    ) -> "Network":
         """Compute the network of one sensor from weights that serve every sensor.
 
         Args:
-            weights: the sensor-conditioned weights: their first filters are computed from the
-                sensor's blur and noise.
+            weights: sensor-conditioned weights or their INT8 file. The first filters are computed
+                from the sensor's blur and noise.
             sensor: the sensor profile. If a value is a range, its middle is used.
             int8: True for the INT8 network, False for float32.
 

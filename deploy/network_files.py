@@ -38,6 +38,9 @@ from beers_deploy.quant.sensor_bank.conditioned import (
 
 logger = logging.getLogger(__name__)
 
+UNKNOWN_SENSORS = ("", BLIND, BLIND_PROFILE)
+"""The names of a sensor, in a file's metadata, that stand for none in particular."""
+
 
 @dataclass(frozen=True)
 class Conditioned:
@@ -80,6 +83,30 @@ class Conditioned:
                 f"{self.name}{INT8}.onnx'."
             )
         return int8_for_sensor(load_onnx(shipped), sensor)
+
+
+@dataclass(frozen=True)
+class ConditionedFile:
+    """An INT8 file from which the network of any sensor can be computed.
+
+    It does for a user's INT8 file what `network_files.Conditioned` does for weights.
+
+    Attributes:
+        name: the name of the networks computed from it.
+        stored: the model in the file.
+    """
+
+    name: str
+    stored: onnx.ModelProto
+
+    @property
+    def kernels(self) -> Kernels:
+        """The method by which the filters of the first layer are reduced to 7 x 7 pixels."""
+        return required_conditioned_core(self.stored).kernels
+
+    def model(self, sensor: Sensor, int8: bool) -> onnx.ModelProto:  # noqa: ARG002 - always INT8
+        """Compute the INT8 model for a sensor, of which the middle of each range is used."""
+        return int8_for_sensor(self.stored, sensor)
 
 
 def conditioned(path: Path) -> Conditioned | None:
@@ -163,6 +190,12 @@ def warn_outside(sensor: Sensor, kernels: Kernels) -> None:
             logger.warning(sentence)
 
 
+def serves_every_sensor(model: onnx.ModelProto) -> bool:
+    """Return True for an INT8 network that can be conditioned on any sensor, and is on none yet."""
+    about = metadata(model)
+    return SENSOR_BIASES in about and about.get("sensor", "") in UNKNOWN_SENSORS
+
+
 def other_sensor(model: onnx.ModelProto, sensor: Sensor) -> str:
     """Compare a network's recorded sensor with the one that acquires the images.
 
@@ -171,21 +204,10 @@ def other_sensor(model: onnx.ModelProto, sensor: Sensor) -> str:
         sensor: the sensor of the images. The profile of an unknown sensor contradicts no network.
 
     Returns:
-        A warning for the user if the network was made for another sensor, or could be conditioned
-        on this one and was not; otherwise "".
+        A warning for the user if the network was made for another sensor; otherwise "".
     """
-    if sensor.name == BLIND:
-        return ""
-    about = metadata(model)
-    own = about.get("sensor", "")
-    is_blind = own in ("", BLIND, BLIND_PROFILE)
-    if is_blind and SENSOR_BIASES in about:
-        return (
-            f"look at the sensor: the INT8 file is that of an unknown sensor. For {sensor.name} "
-            "condition it by 'beers-deploy export --network FILE --sensor SENSOR --out NEW', which "
-            "restores better"
-        )
-    if is_blind or own == sensor.name:
+    own = metadata(model).get("sensor", "")
+    if sensor.name == BLIND or own in (*UNKNOWN_SENSORS, sensor.name):
         return ""
     return f"look at the sensor: the network was made for {own}, not for {sensor.name}"
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from beers_deploy.conditioned_file import conditioned_on
 from beers_deploy.dpu.checker.table import check_network
 from beers_deploy.kit.golden import PICTURE, save_array, write_golden
 from beers_deploy.kit.host_facts import host_facts
@@ -87,10 +88,10 @@ class Board(TargetProfile):
             ProfileError: there is no such sensor.
         """
         profile = None if sensor is None else Sensor.load(sensor)
-        conditioned_on = profile or Sensor.load(BLIND)
-        network = Network.load(int8, sensor=conditioned_on)
+        images_of = profile or Sensor.load(BLIND)
+        network = conditioned_on(Network.load(int8, sensor=images_of), images_of)
         folder = Path(out)
-        warning = other_sensor(network.model, conditioned_on)
+        warning = other_sensor(network.model, images_of)
         if warning:
             logger.warning(warning)
         # A missing library is refused before anything is written.
@@ -116,7 +117,7 @@ class Board(TargetProfile):
         network.core(self, vectors_px).save(vectors / "core.onnx")
         if record:
             checked = check_network(network, self, None, tile)
-            write_record(checked, network, conditioned_on, folder / "record")
+            write_record(checked, network, images_of, folder / "record")
         words = {
             "network": markdown_text(network.name),
             "board": markdown_text(self.name),

@@ -10,6 +10,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
+from beers_deploy.conditioned_file import conditioned_on
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.network_files import other_sensor
@@ -78,13 +79,16 @@ def networks_of(
         OptionError: there are several sensors for a network that was made for one, or sensors of
             different bit depths and no full scale.
     """
-    networks = {band: Network.load(network, sensor=sensor) for band, sensor in sensors.items()}
+    networks = {
+        band: conditioned_on(Network.load(network, sensor=sensor), sensor)
+        for band, sensor in sensors.items()
+    }
     first = next(iter(networks.values()))
     if first.weights is None and len(sensors) > 1:
         raise OptionError(
             f"`sensor` names a sensor for each band, but {first.label} was made for one sensor. "
             "Give one sensor for all bands, or use a shipped network, or weights of 'train "
-            "--conditioned'."
+            "--conditioned' or their INT8 file."
         )
     bits = {int(sensor.bits.low) for sensor in sensors.values()}
     if len(bits) > 1 and full_scale is None:

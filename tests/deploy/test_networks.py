@@ -12,6 +12,7 @@ import tifffile
 
 import beers_deploy as bd
 from beers_deploy.comparison import pair_of
+from beers_deploy.conditioned_file import conditioned_on
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.shipped import (
     INT8,
@@ -226,11 +227,32 @@ def test_a_run_parses_and_opens_a_network_once(
     assert counts == {"parse_onnx": 1, "tiling_of": 1, "InferenceSession": 1}
 
 
-def test_a_file_for_an_unknown_sensor_says_how_to_condition_it() -> None:
-    """An INT8 file for every sensor restores blindly where it is given by its path."""
-    stored = load_onnx(SHIPPED / "convbeers-xs-int8.onnx")
-    sensor = Sensor.load("dior-medium")
-    assert "beers-deploy export --network" in other_sensor(stored, sensor)
-    conditioned_on = int8_for_sensor(stored, sensor)
-    assert not other_sensor(conditioned_on, sensor)
-    assert "made for dior-medium" in other_sensor(conditioned_on, Sensor.load("pleiades-degraded"))
+@pytest.mark.parametrize("sensor", ["dior-medium", "pleiades-degraded"])
+def test_an_int8_file_for_every_sensor_restores_and_is_judged_as_the_shipped_name(
+    sensor: str, tmp_path: Path
+) -> None:
+    """A recipe's INT8 file is given by its path, and must not restore for the middle of the range
+    of sensors.
+    """
+    copy = tmp_path / "int8.onnx"
+    copy.write_bytes((SHIPPED / "convbeers-xs-int8.onnx").read_bytes())
+    # Dark ground needs the exposures as well.
+    pixels = np.random.default_rng(0).integers(40, 400, (61, 83)).astype(np.uint16)
+    restored = bd.restore(pixels, network=copy, sensor=sensor, tile=48)
+    assert np.array_equal(
+        restored, bd.restore(pixels, network="convbeers-xs-int8", sensor=sensor, tile=48)
+    )
+    stored = bd.restore(pixels, network=copy, tile=48)
+    assert not np.array_equal(restored, stored)
+    files = bd.gate(shipped_weights("convbeers-xs"), copy, sensor=sensor, patches=4)
+    pair = bd.gate("convbeers-xs", sensor=sensor, patches=4)
+    assert "INT8 against float" in [row.name for row in pair.rows]
+    assert [row.figures for row in files.rows] == [row.figures for row in pair.rows]
+
+
+def test_an_int8_file_that_was_conditioned_on_a_sensor_keeps_it() -> None:
+    """Only a file for every sensor is conditioned again."""
+    own = int8_for_sensor(load_onnx(SHIPPED / "convbeers-xs-int8.onnx"), Sensor.load("dior-medium"))
+    network = Network.load(own)
+    assert conditioned_on(network, KNOWN) is network
+    assert "made for dior-medium" in other_sensor(own, KNOWN)

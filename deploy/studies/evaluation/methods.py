@@ -14,12 +14,13 @@ from typing import Final
 import onnx
 import torch
 
+from beers_deploy.conditioned_file import conditioned_on
 from beers_deploy.model.shipped import INT8, shipped_names
 from beers_deploy.model.traditional.baselines import BASELINES
 from beers_deploy.model.traditional.patch_groups import QUALITIES
 from beers_deploy.model.traditional.pipeline import Order, TraditionalPipeline, restore_traditional
 from beers_deploy.network import Network
-from beers_deploy.network_files import conditioned, other_sensor, warn_outside
+from beers_deploy.network_files import other_sensor
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.instrument import Instrument
@@ -139,20 +140,18 @@ def method_named(name: str, degraded: Sensor, reference: Sensor, around: Around 
             f"{printable(repr(name))} in `methods` is not a method. Give {METHOD_NAMES}."
         )
     sensor = Sensor.load(other) if other else degraded
-    weights = conditioned(Path(network))
+    loaded = conditioned_on(Network.load(network, sensor=sensor), sensor)
+    weights = loaded.weights
+    method = method_of(name, loaded, sensor, reference, around, degraded.name)
     if weights is None:
-        loaded = Network.load(network)
         warning = other_sensor(loaded.model, sensor)
         if warning:
             logger.warning("%s: %s", network, warning)
-        return method_of(name, loaded, sensor, reference, around, degraded.name)
-    int8 = network.endswith(INT8)
-    warn_outside(sensor, weights.kernels)
-    network_for = Network.for_sensor(weights, sensor, int8=int8)
-    method = method_of(name, network_for, sensor, reference, around, degraded.name)
+        return method
     # A name with @SENSOR asks for that sensor: another one does not take its place.
     if other:
         return method
+    int8 = loaded.precision == "int8"
 
     def specialise(instrument: Instrument) -> Restore:
         profile = profile_of(instrument, degraded)

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, pixel_shuffle, pixel_unshuffle
 
 from beers_deploy.comparison import pair_of
+from beers_deploy.conditioned_file import conditioned_on
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import BeersError, ModelError
@@ -175,7 +176,11 @@ def open_subject(
     """
     profile = Sensor.load(sensor)
     if int8_network is not None or _is_pair(float_network):
-        subject = Subject(*map(Runner, pair_of(float_network, int8_network, profile)))
+        floating, int8 = pair_of(float_network, int8_network, profile)
+        # A file for every sensor is tested under the sensor that the float network has.
+        if floating.weights is not None:
+            int8 = conditioned_on(int8, profile)
+        subject = Subject(Runner(floating), Runner(int8))
     else:
         floating = Network.load(float_network, sensor=profile, int8=False)
         require_quantized(floating.model, floating.label, expected=False)

@@ -1,0 +1,31 @@
+"""Condition an INT8 file that serves every sensor on the sensor of the images to restore.
+
+`quantize` and `train --recipe` write such files for sensor-conditioned weights. As it is stored,
+the file is the network for the middle of the range of sensors. Behind six sensors with an MTF of
+7 % at Nyquist, it restored ten photographs 2 to 13 dB worse than conditioned on them (measured).
+"""
+
+from dataclasses import replace
+
+from beers_deploy.network import Network
+from beers_deploy.network_files import ConditionedFile, serves_every_sensor, warn_outside
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import BLIND
+
+
+def conditioned_on(network: Network, sensor: Sensor) -> Network:
+    """Condition a network on the sensor of the images, if it is an INT8 file for every sensor.
+
+    Args:
+        network: any network.
+        sensor: the sensor of the images.
+
+    Returns:
+        The INT8 network of the sensor, with its exposures. Any other network is returned unchanged,
+        as is a file that was already conditioned on a sensor, and each file for an unknown sensor.
+    """
+    if sensor.name == BLIND or not serves_every_sensor(network.model):
+        return network
+    file = ConditionedFile(network.name, network.model)
+    warn_outside(sensor, file.kernels)
+    return replace(Network.for_sensor(file, sensor, int8=True), name=network.name)
