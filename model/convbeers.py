@@ -66,8 +66,10 @@ class ResidualBlock(nn.Module):
 
 
 class Layers(nn.Module):
-    """The layers that both networks share. `planes` is the number of input planes per pixel of the
-    head.
+    """The layers that `ConvBEERS` and `BankedConvBEERS` share.
+
+    `planes` is the number of planes that the head reads for each pixel: 1 for the image, and more
+    behind a filter bank.
     """
 
     def __init__(self, variant: Variant, planes: int) -> None:
@@ -81,7 +83,8 @@ class Layers(nn.Module):
     def corrected(self, shallow: Tensor, bfloat16: bool, steps: Sequence[Tensor] = ()) -> Tensor:
         """Compute the correction (N, 1, H, W) from the output of the head, (N, F, H / S, W / S).
 
-        Given `steps` (see `Rounding.steps`), all maps are rounded.
+        Given `steps` (see `Rounding.steps`), the maps between head and tail are rounded. With
+        `bfloat16` the layers between head and tail compute in it, their sums stay in float32.
         """
         with torch.autocast(shallow.device.type, dtype=torch.bfloat16, enabled=bfloat16):
             deep = (
@@ -276,7 +279,8 @@ class OfOneSensor(nn.Module):
 
     Args:
         network: the network for every sensor.
-        vector: the sensor vector, shape (4,).
+        vector: the sensor vector (4,): MTF across and along the track and noise at two
+            brightnesses, each scaled to [-1, 1].
         bank: the filters of the sensor; None builds those of the vector's MTF and noise.
     """
 

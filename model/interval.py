@@ -214,13 +214,16 @@ def noise_and_detail(
     variances: tuple[float, float, float],
     offset: float,
 ) -> tuple[Array, Array]:
-    """Compute the noise sigma and the local detail s / sigma of every pixel, (h, w) each.
+    """Compute the noise and the local detail of every pixel, (h, w) each.
+
+    sigma is the noise, in pixel values, that the sensor has at the mean of the 3 x 3 known pixels
+    around a pixel. The detail is s / sigma, with s the standard deviation of these pixels.
 
     Sums of integers are exact in float64, so that a window gives the same numbers in any tile.
 
     Args:
         restored: (h, w) pixel values as they are stored.
-        known: see `HalfWidth.of`.
+        known: (h, w), False for missing pixels.
         variances: the variances of the noise, see `HalfWidth`.
         offset: the pixel value of the dark.
     """

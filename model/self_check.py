@@ -232,11 +232,12 @@ def _beyond(placed: Placed, side: int) -> tuple[int, int]:
 
 
 def noise_variances(sensor: Instrument, full_scale: float) -> tuple[float, float, float]:
-    """Return the noise's variance in the dark, its growth with the light, and its share of the
-    squared light, in pixel values.
+    """Return the numbers a, b and c of the variance a + b x + c x^2 of a pixel's noise.
+
+    x is the pixel value less that of the dark. a is in squared pixel values, b in pixel values.
 
     The differences of detectors that a profile states count as noise, because no single one of them
-    is known. 1/12 is the variance of rounding to integers.
+    is known. 1/12 DN^2, the variance of rounding to integers, is a part of a.
 
     Args:
         sensor: the instrument.

@@ -113,7 +113,7 @@ class Group(TyperGroup):
         return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the chosen command. Exit with 70 if some of its output could not be written."""
+        """Run the chosen command. Exit with 70 if some of its standard output was lost."""
         closed = sys.stdout is None
         with lasting_streams(self.results_on_stdout) as out:
             result = super().invoke(ctx)

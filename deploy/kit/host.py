@@ -102,7 +102,7 @@ def offset_windows(coarse: np.ndarray, *windows: np.ndarray) -> np.ndarray:
 
 
 def bank_sum(fine: np.ndarray, coarse: np.ndarray, *analytic: np.ndarray) -> np.ndarray:
-    """Add the network's correction and the linear restoration, which has several copies."""
+    """Add the network's correction to the linear restoration, the sum of its analytic copies."""
     added = np.sum(analytic[: S["fine_copies"]], 0) * F(S["fine_gain"])
     # The last copy may be a coarse one, for values at which the others are clipped.
     if S["coarse_gain"]:
@@ -315,7 +315,7 @@ def around(means: np.ndarray, far: np.ndarray) -> np.ndarray:
 
 
 def inner(count: int) -> tuple[int, int]:
-    """Return (first, end) of the blocks that count: of more than 4, all but 2 at each end."""
+    """Return (first, end) of the blocks off the border: of more than 4, without 2 per end."""
     return (2, count - 2) if count > 4 else (0, count)
 
 

@@ -262,7 +262,9 @@ def interval_ends(figure: Figure) -> Interval:
 
 
 def pipeline_rate(swath: Swath, latency: Figure) -> Figure:
-    """Return the tiles per second of the traditional pipeline, counted as the paper counts them.
+    """Return the rate of the traditional pipeline in tiles per second, as the paper counts them.
+
+    It is the pixels of the swath over those of a tile without halo, over the time.
 
     Args:
         swath: the image and its tiles.

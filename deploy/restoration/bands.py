@@ -160,7 +160,7 @@ def require_alike(networks: Sequence[Network]) -> None:
 
     Args:
         networks: one network for all bands, which is accepted, or one for each. Several must read
-            one band each and have the same receptive radius, stride and scale.
+            one band each and have equal tilings: halo, stride, scale, bands and accepted sizes.
     """
     tilings = [network.tiling for network in networks]
     if len(networks) > 1 and (len(set(map(repr, tilings))) > 1 or tilings[0].channels_in != 1):

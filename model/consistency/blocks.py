@@ -101,11 +101,11 @@ def extend(
 
 
 def weighted_sums(image: Image, weights: Image, axis: int, block_px: int = BLOCK_PX) -> Image:
-    """Compute weighted sums over windows of pixels along an axis.
+    """Compute weighted sums over all windows of pixels along an axis that lie within the image.
 
     Args:
         image: the pixels (h, w).
-        weights: the weight of each pixel of a window, whose length it gives.
+        weights: (K,) the weight of each of the K pixels of a window.
         axis: the axis of the windows, 0 or 1.
         block_px: the distance between the starts of neighbouring windows in pixels.
     """

@@ -226,14 +226,15 @@ class AxisMtf:
 
 
 def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
-    """Estimate the MTF along one axis from the edges across it.
+    """Estimate the MTF at Nyquist along one axis from the edges across it.
 
-    The shape of the curve is not fixed: each shape is weighted by how well it explains the edges.
+    Several shapes of the curve are fitted. Each is weighted by how well it explains the edges and
+    by a prior, which gives half to the curve of sensor profiles.
 
     Args:
         own: the blurs of the edges across this axis, at least two, all in regions of one size.
-        others: the blurs of the edges across the other axis, which correct for inclined edges; may
-            be empty.
+        others: the blurs of the edges across the other axis, from which the fit of the profiles'
+            curve corrects inclined edges; may be empty.
     """
     # Imported here: who measures no sensor need not wait for SciPy.
     from scipy.special import stdtrit

@@ -284,7 +284,7 @@ def require_small_offset(name: str, offset: float, scale: float) -> None:
 
 
 def usable_nodata(value: float | None, dtype: np.dtype[Any]) -> float | None:
-    """Return the nodata value of an image, or None if no pixel of its type can have this value."""
+    """Return the nodata value of an image, or None if its pixels are integers without it."""
     if value is None or dtype.kind == "f":
         return value
     limits = np.iinfo(dtype)

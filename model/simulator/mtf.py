@@ -98,17 +98,19 @@ def gaussian_response(frequency: ArrayLike, sigma_px: float) -> NDArray[np.float
 
 
 def smear_response(fy: ArrayLike, length_px: float) -> NDArray[np.float64]:
-    """Compute sinc(length * fy) for fy of any shape: uniform motion along the track during an
-    exposure.
+    """Compute the MTF of uniform motion along the track during an exposure.
 
-    It is 1 for length 0.
+    It is sin(pi x) / (pi x) with x = length_px * fy, for fy of any shape in cycles per pixel of the
+    sensor, and 1 for a length of 0.
     """
     return np.sinc(length_px * np.asarray(fy, np.float64))
 
 
 def sensor_mtf(fx: ArrayLike, fy: ArrayLike, sensor: Instrument) -> NDArray[np.inexact]:
-    """Compute the MTF of a sensor's blur and smear at fx (1, W) and fy (H, 1), as in
-    `mtf`: (H, W).
+    """Compute the MTF (H, W) of a sensor's blur and smear.
+
+    The frequencies fx (1, W) and fy (H, 1) are in cycles per pixel of the sensor. For a
+    point-spread function the result is complex.
     """
     response = mtf(fx, fy, sensor.blur, sensor.antialias_px)
     return response * smear_response(fy, sensor.smear_px) if sensor.smear_px else response

@@ -242,7 +242,7 @@ def tree(
 
 
 def box(corner: Point, width: float, height: float, angle: float) -> list[Point]:
-    """Return the corners of a rectangle rotated about its first corner."""
+    """Return the corners of a rectangle, rotated about its first corner by `angle` radians."""
     place = turn(*corner, angle)
     return [place(0, 0), place(width, 0), place(width, height), place(0, height)]
 

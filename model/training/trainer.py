@@ -154,8 +154,8 @@ class Trainer:
     Args:
         variant: the size of the network.
         recipe: the parameters of the run.
-        loss: the loss that the recipe weights.
-        worker: the rank of this process, and the number of processes that train together.
+        loss: the loss; None builds that of the recipe's weights.
+        worker: this process among those that train together; None trains alone.
         device: the device that computes the steps.
         start: a network of the same kind and size to continue from; None draws new weights.
         precision: number format of the body; it depends on the machine, and a resumed run may use

@@ -76,7 +76,9 @@ class Plain:
         return self
 
     def decode(self, result: np.ndarray, scale: float) -> np.ndarray:  # noqa: ARG002 - as above
-        """Combine the copies that the core writes of each channel to one value.
+        """Return the result unchanged, because the core writes each channel once.
+
+        Decodings of several copies combine the copies of each channel to one value here.
 
         Args:
             result: (N, copies C, H, W) float32, multiples of `scale`.

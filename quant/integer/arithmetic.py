@@ -152,8 +152,9 @@ def window_maxima(image: np.ndarray, op: MaxPool) -> np.ndarray:
 
 
 def means(image: np.ndarray, op: AveragePool) -> tuple[np.ndarray, int, float]:
-    """Compute the mean of each window of an average pool as the DPU does: a sum times an integer,
-    then a shift.
+    """Compute the sum of each window of an average pool times an integer.
+
+    A right shift then makes the mean of it, as on the DPU. Zeros of the padding count.
 
     Args:
         image: int8 values (N, C, H, W).
@@ -161,7 +162,7 @@ def means(image: np.ndarray, op: AveragePool) -> tuple[np.ndarray, int, float]:
 
     Returns:
         The sums times the factor of `mean_factor`, (N, C, H', W') int64; the right shift that makes
-        means of them; and the number of bits, without the sign, that they cannot exceed.
+        means of them; and log2 of the largest magnitude that these sums can have.
     """
     assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
     factor, shift = mean_factor(op.kernel)

@@ -68,7 +68,7 @@ class ConditionedCore:
         return "fitted" if self.core.host_part.decoding == BankSum(coarse_copies=1) else "cut"
 
     def for_sensor(self, bank: Bank, vector: Sequence[float]) -> IntCore:
-        """Return the core for one sensor, with its filters, biases and unit.
+        """Return the core for one sensor: its filters, its biases and the unit of its result.
 
         Args:
             bank: the filters of the sensor.

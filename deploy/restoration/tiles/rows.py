@@ -279,7 +279,8 @@ def restore_floats(
 
     Args:
         dn: digital numbers (H, W) of 0 to `max_dn`. NaN is a missing pixel, and stays NaN.
-        network: the network ready to run, with versions for higher exposures or without.
+        network: a function that runs the network, or an `ExposedNetwork`, which has further
+            versions of it for dark pixels.
         plan: how the image is cut into tiles.
         max_dn: the largest digital number, which is 1.0 to the network; by default that of 12 bits.
         consistency: the step that makes the result agree with the raw image at low spatial
@@ -320,7 +321,8 @@ def restore_dn(
 
     Args:
         dn: digital numbers (H, W) of 0 to `max_dn`. NaN is a missing pixel, and stays NaN.
-        network: the network ready to run, with versions for higher exposures or without.
+        network: a function that runs the network, or an `ExposedNetwork`, which has further
+            versions of it for dark pixels.
         plan: how the image is cut into tiles.
         max_dn: the largest digital number, which is 1.0 to the network; by default that of 12 bits.
         consistency: the step that makes the result agree with the raw image at low spatial

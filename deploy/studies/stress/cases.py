@@ -103,7 +103,7 @@ def star(side: int, _: np.random.Generator) -> list[np.ndarray]:
 
 
 def noisy(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """Draw a landscape (`ground`) at a signal-to-noise ratio of 3: one image (side, side)."""
+    """Draw one landscape (side, side) whose noise is a third of the signal at every brightness."""
     clean = ground(side, generator)
     return [_digital(clean * (1 + generator.standard_normal(clean.shape) / 3))]
 
