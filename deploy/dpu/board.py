@@ -224,7 +224,7 @@ def device_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
     Raises:
         OptionError: the board has an NPU and a configuration is given, or has neither a DPU nor an
             NPU.
-        ProfileError: there is no such configuration.
+        ProfileError: there is no such configuration, or the profile lacks a constant of the device.
     """
     if not profile.npu:
         return dpu_of(profile, configuration)

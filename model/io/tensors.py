@@ -88,7 +88,11 @@ def _sort_metadata(path: Path) -> None:
 
 
 def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
-    """Read the named arrays, of any shape, and the JSON header of a safetensors file."""
+    """Read the named arrays, of any shape, and the JSON header of a safetensors file.
+
+    Raises:
+        ModelError: the file cannot be read, or is no safetensors file.
+    """
     try:
         with safe_open(path, framework="np") as file:
             header = {key: parse_json(value) for key, value in (file.metadata() or {}).items()}

@@ -238,7 +238,11 @@ def fitting_oversampling(
 
 
 def crop_margin(image: np.ndarray, margin_px: int) -> np.ndarray:
-    """Cut `margin_px` from every side of (..., H, W)."""
+    """Cut `margin_px` pixels from every side of images (..., H, W).
+
+    Raises:
+        ImageError: nothing would be left of the images.
+    """
     height, width = image.shape[-2:]
     if min(height, width) <= 2 * margin_px:
         raise ImageError(

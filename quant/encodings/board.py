@@ -264,7 +264,8 @@ def save_config(core: Path, device: str) -> Path:
 
     Args:
         core: the path of the VINT8 file, in whose folder the configuration is written.
-        device: the name of the device in AMD's words. All other settings are defaults.
+        device: the name of the device in AMD's words. All other settings are the same for every
+            network.
     """
     names = ("init", "vaiml_partition")
     vaiml = {"device": device, "optimize_level": 2}

@@ -75,7 +75,11 @@ class Frames:
         return not self.black_dn and self.darkest_dn > DARK_SHARE * self.full_scale_dn
 
     def read(self, path: Path) -> np.ndarray:
-        """Read the digital numbers (H, W) of one frame, float64, with 0 where they are missing."""
+        """Read the digital numbers (H, W) of one frame, float64, with 0 where they are missing.
+
+        Raises:
+            ImageError: the image has several bands, or values that are no digital numbers.
+        """
         return read_raw(path).astype(np.float64) / self.step
 
     def tiles(self, path: Path) -> Iterator[np.ndarray]:
