@@ -2,12 +2,16 @@
 
 import logging
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from beers_deploy.model.shipped import SHIPPED
+from beers_deploy.network_files import int8_for_sensor
 from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.studies.evaluation.methods import (
     BLIND,
     KNOWN,
@@ -76,10 +80,27 @@ def test_who_can_know_a_sensor_says_so_and_what_depends_on_none_stays_as_it_is()
     assert (method.with_sensor(OTHER).sensor_known, method.sensor_known) == (KNOWN, BLIND)
 
 
-def test_a_file_for_an_unknown_sensor_is_a_warning(caplog: pytest.LogCaptureFixture) -> None:
-    file = str(SHIPPED / "convbeers-xs-int8.onnx")
+def test_a_file_for_every_sensor_is_the_method_of_its_shipped_name() -> None:
+    """It knows the sensor of the images, and gets to know others."""
+    dn = np.random.default_rng(0).integers(40, 400, (40, 47)).astype(np.float32)
+    name = "convbeers-xs-int8"
+    method = method_named(str(SHIPPED / f"{name}.onnx"), DEGRADED, REFERENCE)
+    shipped = method_named(name, DEGRADED, REFERENCE)
+    assert method.sensor_known == shipped.sensor_known == KNOWN
+    assert np.array_equal(method.restore(dn), shipped.restore(dn))
+    others = [each.with_sensor(OTHER).restore(dn) for each in (method, shipped)]
+    assert np.array_equal(*others)
+    assert not np.array_equal(others[0], method.restore(dn))
+
+
+def test_a_file_of_another_sensor_is_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    stored = load_onnx(SHIPPED / "convbeers-xs-int8.onnx")
+    file = tmp_path / "medium.onnx"
+    save_onnx(int8_for_sensor(stored, Sensor.load("dior-medium")), file)
     with caplog.at_level(logging.WARNING):
         method_named(f"{file}@blind", DEGRADED, REFERENCE)
         assert not caplog.messages
-        method_named(file, DEGRADED, REFERENCE)
-    assert any("that of an unknown sensor" in message for message in caplog.messages)
+        method_named(str(file), DEGRADED, REFERENCE)
+    assert any("made for dior-medium" in message for message in caplog.messages)
