@@ -304,7 +304,7 @@ def compared(
         float_session = open_any_size(floating.model)
     with faults_named(int8.label):
         # A file for every sensor is compared under the sensor that the float network has.
-        runs = int8 if floating.weights is None else conditioned_on(int8, data.sensor)
+        runs = int8 if floating.profile is None else conditioned_on(int8, floating.profile)
         result = differences_of(float_session, open_any_size(runs.model), patches, metric)
         shares = saturated_shares(runs.model, patches.degraded)
     rests_on = [sensor_input(data.sensor), *data.inputs]

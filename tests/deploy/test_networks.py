@@ -248,6 +248,12 @@ def test_an_int8_file_for_every_sensor_restores_and_is_judged_as_the_shipped_nam
     pair = bd.gate("convbeers-xs", sensor=sensor, patches=4)
     assert "INT8 against float" in [row.name for row in pair.rows]
     assert [row.figures for row in files.rows] == [row.figures for row in pair.rows]
+    # Two networks of an unknown sensor stay that.
+    unknown = bd.gate(
+        Network.load("convbeers-xs"), Network.load("convbeers-xs-int8"), sensor=sensor, patches=4
+    )
+    assert [row.figures for row in unknown.rows] != [row.figures for row in pair.rows]
+    assert unknown.rows[0].figures["MAE"].value < 2 * pair.rows[0].figures["MAE"].value
 
 
 def test_an_int8_file_that_was_conditioned_on_a_sensor_keeps_it() -> None:

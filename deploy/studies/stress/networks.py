@@ -178,8 +178,8 @@ def open_subject(
     if int8_network is not None or _is_pair(float_network):
         floating, int8 = pair_of(float_network, int8_network, profile)
         # A file for every sensor is tested under the sensor that the float network has.
-        if floating.weights is not None:
-            int8 = conditioned_on(int8, profile)
+        if floating.profile is not None:
+            int8 = conditioned_on(int8, floating.profile)
         subject = Subject(Runner(floating), Runner(int8))
     else:
         floating = Network.load(float_network, sensor=profile, int8=False)
