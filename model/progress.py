@@ -143,7 +143,9 @@ class Steps:
         self.show(f"{self.label} {note}".strip(), f"{self.label}: {self.done}/{self.total} {note}")
 
     def show(self, text: str, line: str) -> None:
-        """Show the present state of the work, on a bar as `text` or as a plain line."""
+        """Show the present state of the work: as `text` on a bar or to the caller's function, or as
+        a plain `line` now and then; nothing if progress is off.
+        """
         sink = _sink.get()
         if callable(sink):
             sink(Step(text, self.done, self.total))

@@ -397,8 +397,9 @@ def gate_row(result: GateResult, shares: Mapping[str, float] | None = None) -> R
 
 
 def figure_of(value: float, unit: str, source: str, missing: str) -> Figure:
-    """Return a measured value as a figure for a table; an infinite or NaN value becomes an
-    unavailable one.
+    """Return a measured value as a figure for a table.
+
+    An infinite value and NaN become unavailable figures, each with its reason.
 
     Args:
         value: the value in the unit. Infinity is taken for the PSNR of identical images.

@@ -56,9 +56,9 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
         The model, with all weights in memory.
 
     Raises:
-        ModelError: the file is missing, empty or not ONNX, has weights that are not finite, was
-            exported in training mode, or cannot be trusted (see `quant.untrusted` and
-            `quant.onnx.runnable`).
+        ModelError: the file is missing, empty or not ONNX, has weights that are not finite, or
+            cannot be trusted (see `quant.untrusted`). If `to_run`, also if it was exported in
+            training mode or cannot be run (see `quant.onnx.runnable`).
     """
     try:
         content = read_whole(path, FILE_BYTES)

@@ -63,7 +63,7 @@ def shuffled(x: np.ndarray, r: int, up: bool) -> np.ndarray:
 def encoded(image: np.ndarray) -> np.ndarray:
     """Encode a tile (1, C, h, w) as the planes (1, P, h', w') that the core reads as int8 / 128.
 
-    Each pixel in 12 bits is split into coarse steps and a rest, which is also given in parts.
+    Each pixel in 12 bits is split into coarse steps, the rest, and the rest in steps of `part`.
     """
     wide = np.pad(image, ((0, 0), (0, 0), *[(S["border_px"],) * 2] * 2), "reflect")
     places = shuffled(wide, S["front"], up=False)

@@ -123,8 +123,9 @@ def published_rows() -> list[Row]:
 def processor_row(swath: Swath, board: TargetProfile) -> Row:
     """Predict the traditional pipeline on the board's own processor, for comparison with a DPU.
 
-    The time is that of 10^6 pixels in the board's file, scaled by the number of pixels. Figures
-    that the file does not state are unavailable.
+    The time is that of 10^6 pixels in the board's file, scaled by the number of pixels. If the file
+    does not state it, the latency is unavailable, and there are no throughput and no efficiency. A
+    power that the file does not state is unavailable too.
 
     Args:
         swath: the image.

@@ -169,10 +169,11 @@ class Consistency:
     def correction(
         self, raw: Image, restored: Image, down: Placed, across: Placed, raw_at: tuple[int, int]
     ) -> Image:
-        """Compute the correction G (y - H x) for the kept pixels.
+        """Compute the correction for the kept pixels: G (y - H x), and that of finer detail.
 
-        Blocks near missing or saturated pixels are excluded. Pixels around them get the correction
-        of the other blocks, which fades out where too few of these are near.
+        y counts less the amount that clipping the noise at zero adds. Blocks with a missing or
+        saturated pixel within NEAR_PX are excluded. Pixels around them get the correction of the
+        other blocks, which fades out where these have less than LEAST_SHARE of the weights.
 
         Args:
             raw: y, (h, w) pixel values; they reach RAW_REACH_PX beyond the kept pixels, as far as

@@ -60,10 +60,10 @@ def image_blocks(images: Iterable[np.ndarray], clipped_at: float, black_dn: floa
 
     Args:
         images: digital numbers (H, W) of each image.
-        clipped_at: the smallest digital number that counts as clipped; blocks with such a pixel are
-            left out.
+        clipped_at: the smallest digital number that counts as clipped. Blocks with such a pixel, or
+            with one of 0, are left out.
         black_dn: the digital number without light, which is subtracted from the means of the
-            blocks.
+            blocks; these end at 0.
     """
     return above_black(join([cut_blocks(image, clipped_at) for image in images]), black_dn)
 

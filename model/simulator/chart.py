@@ -55,12 +55,12 @@ def chart(generator: np.random.Generator) -> NDArray[np.float32]:
 
 
 def flat(level: float, _generator: np.random.Generator) -> Pattern:
-    """Return a square with one radiance everywhere."""
+    """Return a square with the radiance `level`, in W/m2/sr/um, everywhere."""
     return np.full((SQUARE_PX, SQUARE_PX), level)
 
 
 def bars(level: float, generator: np.random.Generator) -> Pattern:
-    """Draw bars of any direction, between a sine and a square wave."""
+    """Draw bars of any direction, between a sine and a square wave, around the radiance `level`."""
     y, x = _coordinates()
     angle = float(generator.uniform(0, math.pi))
     # Rows and columns are the commonest direction, and the hardest: they alias.
@@ -80,13 +80,15 @@ def zone_plate(level: float, generator: np.random.Generator) -> Pattern:
 
 
 def soft_texture(level: float, generator: np.random.Generator) -> Pattern:
-    """Draw 1/f texture of low contrast, as of fields, lawn and water."""
+    """Draw 1/f texture of low contrast around the radiance `level` in W/m2/sr/um, as of fields and
+    lawn.
+    """
     pattern = np.log(texture(SQUARE_PX, SQUARE_PX, generator))
     return np.asarray(level * np.exp(pattern * float(generator.uniform(0.05, 1.0))), np.float64)
 
 
 def discs(level: float, generator: np.random.Generator) -> Pattern:
-    """Draw discs that are a little brighter or darker than the ground."""
+    """Draw discs that are a little brighter or darker than the ground of radiance `level`."""
     y, x = _coordinates()
     pattern = np.full((SQUARE_PX, SQUARE_PX), level)
     for _ in range(12):
@@ -99,7 +101,7 @@ def discs(level: float, generator: np.random.Generator) -> Pattern:
 
 
 def points(level: float, generator: np.random.Generator) -> Pattern:
-    """Draw points of light on flat ground."""
+    """Draw points of light on flat ground of radiance `level`."""
     pattern = np.full((SQUARE_PX, SQUARE_PX), level)
     for _ in range(30):
         row, column = generator.integers(SQUARE_PX, size=2)

@@ -139,8 +139,9 @@ def transfer_function(
     """Compute MTF and smear on the half spectrum of a scene: (H, W // 2 + 1) float32, to multiply
     an rfft2.
 
-    `height` and `width` are in scene pixels, and `oversampling` scene pixels make one target pixel.
-    It is complex64 for a point-spread function, which may be asymmetric or inclined.
+    `height` and `width` are in scene pixels, and `oversampling` scene pixels make one target pixel,
+    the unit of `antialias_sigma_px` and `smear_px`. For a point-spread function, which may be
+    asymmetric or inclined to the axes, the result is complex64.
     """
     aslant = isinstance(blur, PointSpread)
     # Only a transfer that is even in fy can be computed from half of the rows.

@@ -264,7 +264,7 @@ def rounded(sums: np.ndarray, shift: int, half_even: bool) -> tuple[np.ndarray, 
 
     Args:
         sums: integers of any shape.
-        shift: the right shift in bits; a negative one shifts left.
+        shift: the right shift in bits; a negative one shifts left, by at most 8 bits.
         half_even: True rounds ties to even, False up.
 
     Returns:

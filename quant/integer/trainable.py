@@ -167,7 +167,7 @@ class TrainableCore(torch.nn.Module):
 
         Returns:
             Each tensor (N, C, H, W) by its name, in units of its scale. If the core writes several
-            copies of the result, the last tensor is one copy, which is not rounded.
+            copies of the result, the tensor CORRECTION is computed once, and not rounded.
         """
         tensors = {PLANES: planes}
         parameters = iter(zip(self._convs, self.weights, self.biases, strict=True))

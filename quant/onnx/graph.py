@@ -91,8 +91,8 @@ class Node:
                 size that differs by whole strides gives the same pads.
 
         Returns:
-            Rows and columns of the kernel, and strides, pads and dilations; None if the node states
-            none.
+            Rows and columns of the kernel, and strides, pads and dilations; None if the kernel is
+            not known, or if it or the attributes are not those of two dimensions.
         """
         attribute = self.attributes.get
         sides = (

@@ -53,7 +53,8 @@ class Window:
         return min(-(-room // stride), (size + before - 1) // stride) + 1
 
     def transposed_size(self, axis: int, kernel: int, size: int) -> int:
-        """Return the size of a transposed convolution's result along an axis.
+        """Return the size of a transposed convolution's result along an axis, without ONNX's
+        `output_padding`.
 
         Args:
             axis: 0 for the rows, 1 for the columns.

@@ -104,7 +104,8 @@ class SingleTensors:
         """Return the names of the tensors whose factors are also searched one tensor at a time.
 
         Args:
-            most_groups: the maximum number of groups of channels; with 0 no tensor is tried alone.
+            most_groups: the maximum number of groups into which the channels of one tensor are
+                divided; with 0 no tensor is tried alone.
         """
         few = self.by_channel or len(self.tensors) <= FEW_TENSORS
         return self.tensors if few and most_groups else ()

@@ -174,7 +174,8 @@ def stratified(
 ) -> list[Candidate]:
     """Draw candidates such that they spread over a property: one from each of equally large groups.
 
-    The groups are consecutive parts of the candidates sorted by the property.
+    The groups are consecutive parts of the candidates sorted by the property. If `count` does not
+    divide the number of candidates, the rest with the largest property is never drawn.
 
     Args:
         candidates: at least `count` items.

@@ -196,7 +196,9 @@ class Prediction:
 
     @property
     def streamed_bytes(self) -> int:
-        """Return the bytes of feature maps that pass through memory for one image."""
+        """Return the bytes of feature maps that layers load from memory and store to it, for one
+        image; weights are not counted.
+        """
         return sum(layer.work.map_bytes for layer in self.layers)
 
 

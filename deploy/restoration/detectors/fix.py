@@ -163,7 +163,8 @@ class FixedSource:
     """An image whose faulty pixels are replaced by interpolation between valid neighbours.
 
     A pixel is interpolated along its row and along its column, between the nearest valid pixels
-    within `REACH_PX`. The shorter distance has the larger weight. If neither direction has a valid
+    within `REACH_PX`. The shorter distance has the larger weight, and a direction with a valid
+    pixel on one side only has hardly any. If neither direction has a valid
     pixel, the diagonals are used. Without a valid pixel in reach the pixel stays, and so does a
     missing one.
 

@@ -97,8 +97,8 @@ def open_frames(images: Sequence[Path], bits: int | None, black_level: float | N
 
     Args:
         images: files, and folders whose images are sorted by name.
-        bits: the number of bits of a digital number, or of a stored value; None infers it from
-            clipped pixels.
+        bits: the bits of a digital number, such as 12; or those of a stored value, such as 16, if
+            the file stores multiples of a power of two. None infers them from clipped pixels.
         black_level: the stored value of a pixel without light; None uses 0.
 
     Raises:

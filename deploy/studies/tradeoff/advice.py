@@ -249,8 +249,8 @@ def _violation(point: Measured, constraints: Sequence[Constraint]) -> float:
 
 
 def nearest(points: Sequence[Measured], constraints: Sequence[Constraint]) -> str:
-    """Return the end of a sentence that names the point which comes nearest to the limits, if none
-    complies with them.
+    """Return the end of a sentence that names the point which comes nearest to the limits, or that
+    says that no point has all figures that they name.
 
     Args:
         points: the operating points; may be empty.

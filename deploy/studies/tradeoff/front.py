@@ -121,7 +121,8 @@ class Comparison:
 
     def difference(self, a: Measured, b: Measured) -> Figure:
         """Return the mean PSNR of `a` minus that of `b` in dB, with the interval of the paired
-        difference. There is no interval for fewer than five sites.
+        difference. For fewer than five sites there is no interval, unless the PSNR of both is equal
+        on every image.
         """
         # Differences on the same images: how the images differ from one another drops out.
         pairs = zip(a.images, b.images, strict=True)

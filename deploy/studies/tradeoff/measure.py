@@ -186,8 +186,9 @@ def restore_in_tiles(point: Point, degraded: Sensor, reference: Sensor) -> Resto
 def tiles_of_point(point: Point, shape: tuple[int, ...]) -> Plan:
     """Plan the tiles in which an operating point restores an image.
 
-    An image that is no larger than a tile is cut in two along each side, because an image in one
-    tile would show no seam.
+    Tiles are at most half of the image's shorter side plus two halos. An image of more than about
+    four halos a side is therefore cut at least once along each side, because an image in one tile
+    would show no seam.
 
     Args:
         point: an operating point of a network.

@@ -89,7 +89,7 @@ def test_a_file_for_every_sensor_is_the_method_of_its_shipped_name() -> None:
     assert method.sensor_known == shipped.sensor_known == KNOWN
     assert np.array_equal(method.restore(dn), shipped.restore(dn))
     others = [each.with_sensor(OTHER).restore(dn) for each in (method, shipped)]
-    assert np.array_equal(*others)
+    assert np.array_equal(others[0], others[1])
     assert not np.array_equal(others[0], method.restore(dn))
 
 
