@@ -18,9 +18,10 @@ from beers_deploy.profiles.errors import ImageError, OptionError, printable
 from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.sensor_numbers import numbers_of
 from beers_deploy.quant.encodings import CORE
-from beers_deploy.quant.gate import METRICS, GateResult, gate_row
+from beers_deploy.quant.gate import GateResult, gate_row
 from beers_deploy.quant.gate import compare as differences_of
 from beers_deploy.quant.input_range import UNIT, Ranges
+from beers_deploy.quant.metrics import METRICS
 from beers_deploy.quant.onnx_file import faults_named, metadata, require_quantized
 from beers_deploy.quant.samples.coverage import recorded_range, uncovered
 from beers_deploy.quant.samples.own import (

@@ -28,7 +28,7 @@ from beers_deploy.quant.adapt.adaptation import ADAPTED, Adapted, adapt
 from beers_deploy.quant.core import SHIFTS, Shifts, target_shifts
 from beers_deploy.quant.encodings import host_model, read_core
 from beers_deploy.quant.gate import GateResult, compare, gate_row
-from beers_deploy.quant.integer.reference import integer_rows
+from beers_deploy.quant.integer.agreement import integer_rows
 from beers_deploy.quant.onnx_file import faults_named, load_onnx, metadata, require_quantized
 from beers_deploy.quant.passes.effort import Effort
 from beers_deploy.quant.passes.selection import ALL, Passes

@@ -5,7 +5,8 @@ from itertools import product
 
 import numpy as np
 
-from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
 from beers_deploy.quant.graph import (
     PLANES,
     Add,

@@ -3,14 +3,14 @@ other and with the references.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import onnxruntime as ort
 
-from beers_deploy.model.metrics.fidelity import psnr_db, ssim
-from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
+from beers_deploy.model.metrics.fidelity import psnr_db
+from beers_deploy.profiles.errors import ImageError, ModelError
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.input_range import (
@@ -21,63 +21,11 @@ from beers_deploy.quant.input_range import (
     share_within,
     to_shares,
 )
+from beers_deploy.quant.metrics import METRICS, SCALE, metric_value
 from beers_deploy.quant.samples.coverage import BINS, SampleRange, histogram, range_from
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import result_of
 from beers_deploy.quant.untrusted import times
-
-SCALE = "of full scale"
-
-
-@dataclass(frozen=True)
-class Metric:
-    """A figure by which a user judges results, such as SSIM.
-
-    Attributes:
-        unit: the unit of the figure.
-        larger_is_better: True if a larger value is better.
-        value: function of a result (1, C, H, W) and its reference of the same shape, both in shares
-            of full scale.
-    """
-
-    unit: str
-    larger_is_better: bool
-    value: Callable[[np.ndarray, np.ndarray], float]
-
-
-def _similarity(result: np.ndarray, reference: np.ndarray) -> float:
-    # SSIM is that of one band, so it is the mean over the bands.
-    return float(np.mean([ssim(*pair, 1.0) for pair in zip(result[0], reference[0], strict=True)]))
-
-
-METRICS: Mapping[str, Metric] = {
-    "psnr": Metric("dB", True, lambda result, reference: psnr_db(result, reference, 1.0)),
-    "ssim": Metric("ratio", True, _similarity),
-    "mae": Metric(SCALE, False, lambda result, reference: float(np.abs(result - reference).mean())),
-}
-
-
-def metric_value(name: str, result: np.ndarray, reference: np.ndarray) -> float:
-    """Compare one result with its reference by a metric.
-
-    Args:
-        name: one of `METRICS`.
-        result: (1, C, H, W) in shares of full scale.
-        reference: the image that the result should be, of the same shape.
-
-    Returns:
-        The value in the unit of the metric.
-
-    Raises:
-        OptionError: the reference is not of the size of the result.
-    """
-    if reference.size != result.size:
-        raise OptionError(
-            f"The `metric` {name!r} needs references of {times(result.shape)}, the size of the "
-            f"results, but they have {times(reference.shape)}. Give such references, or leave "
-            "`metric` out."
-        )
-    return METRICS[name].value(result, reference)
 
 
 @dataclass(frozen=True)

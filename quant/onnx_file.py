@@ -5,7 +5,7 @@ is fixed to. How an image may be cut into tiles is determined in `quant.tiling`.
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from itertools import chain, product
@@ -268,23 +268,6 @@ def image_info(name: str, channels: int, tile_px: int | None) -> onnx.ValueInfoP
         [1, channels, tile_px, tile_px] if tile_px else ["N", channels, "H", "W"]
     )
     return onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape)
-
-
-def with_outputs(model: onnx.ModelProto, kinds: Mapping[str, int]) -> onnx.ModelProto:
-    """Return a copy of a model that also returns some of its inner tensors.
-
-    Args:
-        model: any model; not changed.
-        kinds: ONNX's number of the element type of each tensor, by the tensor's name.
-    """
-    extended = deepcopy(model)
-    names = {value.name for value in extended.graph.output}
-    extended.graph.output.extend(
-        onnx.helper.make_tensor_value_info(name, kind, None)
-        for name, kind in kinds.items()
-        if name not in names
-    )
-    return extended
 
 
 OUTPUT = "output"

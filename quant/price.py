@@ -27,8 +27,8 @@ from onnx import helper, numpy_helper
 
 from beers_deploy.model.metrics.fidelity import psnr_db
 from beers_deploy.profiles.figures import Figure, Row, measured
-from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, dequantized
-from beers_deploy.quant.gate import SCALE
+from beers_deploy.quant.core import IntConv, dequantized
+from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
@@ -41,6 +41,7 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.host_part import HostPart
 from beers_deploy.quant.input_range import ranges_of_result, to_shares
+from beers_deploy.quant.metrics import SCALE
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.samples.patches import Pair, Patches
 from beers_deploy.quant.session import open_any_size, open_session, planes_of, result_of

@@ -4,7 +4,8 @@ tiles.
 Reading every tensor of a network at once needs memory that grows with the image; tiles do not.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from copy import deepcopy
 from itertools import islice, pairwise, product
 from pathlib import Path
 
@@ -319,3 +320,20 @@ def few_crops(images: Iterable[np.ndarray], model: onnx.ModelProto) -> list[np.n
     """
     halo_px = None if fixed_tile_px(model) is not None else 0
     return [crops(image, halo_px)[0] for image in islice(images, LAYER_PATCHES)]
+
+
+def with_outputs(model: onnx.ModelProto, kinds: Mapping[str, int]) -> onnx.ModelProto:
+    """Return a copy of a model that also returns some of its inner tensors.
+
+    Args:
+        model: any model; not changed.
+        kinds: ONNX's number of the element type of each tensor, by the tensor's name.
+    """
+    extended = deepcopy(model)
+    names = {value.name for value in extended.graph.output}
+    extended.graph.output.extend(
+        onnx.helper.make_tensor_value_info(name, kind, None)
+        for name, kind in kinds.items()
+        if name not in names
+    )
+    return extended

@@ -25,8 +25,14 @@ from beers_deploy.quant.graph import CORRECTION, Activation, Pointwise
 from beers_deploy.quant.graph.quantized import Scale, stated
 from beers_deploy.quant.host_part import ONE_CHANNEL, ZERO
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
-from beers_deploy.quant.onnx_file import any_size, with_outputs
-from beers_deploy.quant.session import open_any_size, open_session, result_of, tensors_of
+from beers_deploy.quant.onnx_file import any_size
+from beers_deploy.quant.session import (
+    open_any_size,
+    open_session,
+    result_of,
+    tensors_of,
+    with_outputs,
+)
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from beers_deploy.quant.untrusted import contradictions
 

@@ -92,10 +92,8 @@ class Restoration(ABC):
 
     @abstractmethod
     def ticks(self, done_px: int) -> int:
-        """Return the number of progress ticks that remain.
-
-        There is one for each tile of a network, or for each row of pixels of the traditional
-        pipeline.
+        """Return the number of progress ticks that remain: one for each tile of a network, or for
+        each row of pixels of the traditional pipeline.
 
         Args:
             done_px: the number of rows of the restored image that an earlier run finished.

@@ -22,8 +22,7 @@ from onnx import TensorProto
 from beers_deploy.model.progress import step
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.window import Pair, Window
-from beers_deploy.quant.onnx_file import with_outputs
-from beers_deploy.quant.session import open_any_size, tensors_of
+from beers_deploy.quant.session import open_any_size, tensors_of, with_outputs
 from beers_deploy.quant.simplify.fold_affine import is_convolution
 
 MOST_UNKNOWNS = 2304

@@ -22,9 +22,10 @@ import onnx
 from onnx import TensorProto
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.domains import MICROSOFT
 from beers_deploy.quant.encodings.description import KEY, describe, described_core, phases
+from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
 from beers_deploy.quant.graph import (
     CORRECTION,
     IMAGE,

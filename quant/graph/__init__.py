@@ -1,8 +1,8 @@
 """Represent a network as the short list of operations that a DPU computes, which quantisation works
 on.
 
-- `operations`: the operations, from convolutions to pixel shuffles; which tensors must share a
-  scale; and how 12 bits enter int8;
+- `operations`: the operations, from convolutions to pixel shuffles, and how 12 bits enter int8;
+- `ties`: which tensors must share a scale;
 - `reader`: from float ONNX (`node_operations`, one by one) to a `split_network`, cut where the
   host's part ends; `plain` accepts networks of ConvBEERS' kind only;
 - `writer`: back to float ONNX;
@@ -33,8 +33,6 @@ from beers_deploy.quant.graph.operations import (
     read_planes,
     same,
     tensors,
-    tied,
-    ties_scales,
 )
 from beers_deploy.quant.graph.plain import correction_graph, image_channels
 from beers_deploy.quant.graph.reader import read_network, refusal
@@ -44,6 +42,7 @@ from beers_deploy.quant.graph.split_network import (
     check_network,
     require_one_image,
 )
+from beers_deploy.quant.graph.ties import tied, ties_scales
 from beers_deploy.quant.graph.writer import graph_to_onnx
 from beers_deploy.quant.onnx.window import Window
 

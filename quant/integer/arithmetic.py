@@ -8,7 +8,8 @@ from itertools import product
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv
+from beers_deploy.quant.core import IntConv
+from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
 from beers_deploy.quant.graph import Activation, AveragePool, MaxPool, Pointwise, Window
 from beers_deploy.quant.graph.operations import SIX
 

@@ -22,7 +22,8 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
@@ -48,7 +49,6 @@ from beers_deploy.quant.integer.arithmetic import (
 
 Tensor = torch.Tensor
 Bits = Mapping[str, int]
-
 
 NEAR = 0.49
 """How far beyond int8's ends a value may lie without being clipped, because it rounds to them."""
@@ -146,16 +146,8 @@ class TrainableCore(torch.nn.Module):
         return copy
 
     def forward(self, planes: Tensor) -> Tensor:
-        """Compute the core's result for the int8 planes of an image, in real values.
-
-        If the core writes several copies of the result, one copy without rounding is computed
-        instead. Gradients pass through all roundings.
-
-        Args:
-            planes: (N, P, H, W) float32 integers.
-
-        Returns:
-            (N, C, H, W) float32, in the unit of the result.
+        """Compute the core's result, (N, C, H, W) in real values, for the int8 planes (N, P, H, W)
+        of images as float32. Gradients pass through all roundings; see `tensors`.
         """
         return self.tensors(planes)[CORRECTION] * self._core.scale(CORRECTION)
 

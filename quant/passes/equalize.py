@@ -18,7 +18,7 @@ from itertools import product
 import numpy as np
 
 from beers_deploy.model.progress import steps
-from beers_deploy.quant.core import INT8_MAX
+from beers_deploy.quant.frac_bits import INT8_MAX
 from beers_deploy.quant.graph import Activation, Conv, Graph
 from beers_deploy.quant.host_part import ONE_CHANNEL, HostPart
 from beers_deploy.quant.passes.residual_groups import GROUP_FRAC_BITS, ResidualGroup

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from beers_deploy.quant.core import CANDIDATES, squared_errors, unclipped_frac_bits
+from beers_deploy.quant.frac_bits import CANDIDATES, squared_errors, unclipped_frac_bits
 from beers_deploy.quant.graph import PLANES, PLANES_FRAC_BITS, Graph, tensors, tied
 from beers_deploy.quant.host_part import ONE_CHANNEL, HostPart
 from beers_deploy.quant.session import values_of

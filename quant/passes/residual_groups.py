@@ -12,7 +12,7 @@ One scale for a whole group makes its adds exact: nothing has to be aligned, so 
 from collections.abc import Mapping, Sequence
 from itertools import accumulate, chain, repeat
 
-from beers_deploy.quant.core import INT8_MAX
+from beers_deploy.quant.frac_bits import INT8_MAX
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
@@ -27,7 +27,8 @@ from beers_deploy.quant.graph import (
     Resize,
     channels_of,
 )
-from beers_deploy.quant.graph.operations import SIX, united
+from beers_deploy.quant.graph.operations import SIX
+from beers_deploy.quant.graph.ties import united
 
 GROUP_FRAC_BITS = 8
 """The fractional bits of a group. Any value would do, because `equalize` scales the group to it."""

@@ -22,7 +22,7 @@ from itertools import product
 
 from beers_deploy.quant.core import IntCore, Shifts, shift_faults
 from beers_deploy.quant.graph import PLANES, Activation, Add, Conv, Graph, ties_scales
-from beers_deploy.quant.graph.operations import united
+from beers_deploy.quant.graph.ties import united
 from beers_deploy.quant.integer.trainable import TrainableCore
 
 logger = logging.getLogger(__name__)

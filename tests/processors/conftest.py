@@ -11,8 +11,9 @@ import numpy as np
 import onnx
 import pytest
 
-from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings import board_model, read_core
+from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
 from beers_deploy.quant.onnx_file import load_onnx
 from tests.shipped import shipped_pair
 

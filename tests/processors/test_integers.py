@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings import board_model, host_model
+from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
 from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, Activation, same
 from beers_deploy.quant.host_part import IMAGE_SLICES
-from beers_deploy.quant.integer.reference import agreement, correction, merged_correction, run_core
+from beers_deploy.quant.integer.agreement import agreement
+from beers_deploy.quant.integer.reference import correction, merged_correction, run_core
 from beers_deploy.quant.session import open_session, run
 from tests.processors.conftest import Encodings
 

@@ -10,7 +10,8 @@ import pytest
 from beers_deploy.model.shipped import SHIPPED
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.host_part import IMAGE_SLICES
-from beers_deploy.quant.integer.reference import agreement, merged_correction, run_core
+from beers_deploy.quant.integer.agreement import agreement
+from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.quantize import Quantized
 from tests.quant.quick import changed

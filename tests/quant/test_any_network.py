@@ -19,10 +19,11 @@ from beers_deploy.dpu.checker.table import legality
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.bounds import layer_bounds
-from beers_deploy.quant.core import INT8_MAX, INT8_MIN
 from beers_deploy.quant.encodings import as_on_board, board_model, encoding_faults, read_core
 from beers_deploy.quant.encodings.description import KEY
-from beers_deploy.quant.integer.reference import agreement, run_core
+from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
+from beers_deploy.quant.integer.agreement import agreement
+from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from beers_deploy.quant.passes.selection import Passes
 from beers_deploy.quant.quantize import Quantized, quantize_model

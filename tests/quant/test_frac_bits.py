@@ -5,13 +5,8 @@ from hypothesis import strategies as st
 
 from beers_deploy.profiles.errors import ProfileError
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.quant.core import (
-    SHIFTS,
-    best_frac_bits,
-    quantize,
-    target_shifts,
-    unclipped_frac_bits,
-)
+from beers_deploy.quant.core import SHIFTS, target_shifts
+from beers_deploy.quant.frac_bits import best_frac_bits, quantize, unclipped_frac_bits
 
 
 @given(st.floats(1e-6, 1e6))

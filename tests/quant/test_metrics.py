@@ -8,7 +8,8 @@ from torch import nn
 import beers_deploy as bd
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.profiles.errors import ModelError, OptionError
-from beers_deploy.quant.gate import METRICS, compare, metric_value
+from beers_deploy.quant.gate import compare
+from beers_deploy.quant.metrics import METRICS, metric_value
 from beers_deploy.quant.session import open_session
 from examples.networks import build, to_onnx
 from tests.quant.quick import one_guess, patches_of

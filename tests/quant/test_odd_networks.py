@@ -11,7 +11,7 @@ from onnx import numpy_helper
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph import read_network
-from beers_deploy.quant.integer.reference import agreement
+from beers_deploy.quant.integer.agreement import agreement
 from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.structure import saturated_shares, structure_checks

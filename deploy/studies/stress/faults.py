@@ -14,7 +14,8 @@ import numpy as np
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.instrument import MAX_DN
-from beers_deploy.quant.core import INT8_MAX, INT8_MIN, SHIFTS, IntConv, IntCore, op_shifts
+from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, op_shifts
+from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
 from beers_deploy.quant.graph import PLANES, Activation, channels_of
 from beers_deploy.quant.integer.reference import SOUND, Faults, merged_correction, run_core
 
@@ -104,9 +105,7 @@ def weight_bits(core: IntCore) -> int:
 
 
 def flip_weights(core: IntCore, count: int, generator: np.random.Generator) -> IntCore:
-    """Return an integer core, as the board stores it, with `count` different random bits of its
-    weights and bias flipped.
-    """
+    """Return a core with `count` different random bits of its stored weights and bias flipped."""
     sizes = np.array([op.weight.size + op.bias.size for op in core.convolutions])
     # How many of the bits fall into each layer, as if all were drawn from one memory without
     # replacement.

@@ -1,0 +1,164 @@
+"""Compare the integer reference with onnxruntime, layer by layer, and report the comparison."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import onnx
+
+from beers_deploy.profiles.figures import Figure, Row, measured, predicted
+from beers_deploy.quant.core import IntCore
+from beers_deploy.quant.host_part import ZERO
+from beers_deploy.quant.input_range import to_shares
+from beers_deploy.quant.integer.reference import (
+    BITS_SOURCE,
+    NARROW_BITS,
+    LayerReport,
+    merged_correction,
+    run_core,
+)
+from beers_deploy.quant.onnx_file import any_size
+from beers_deploy.quant.session import (
+    few_crops,
+    open_any_size,
+    open_session,
+    result_of,
+    with_outputs,
+)
+
+
+@dataclass(frozen=True)
+class LayerAgreement:
+    """A comparison of one operation's results: the DPU's rule for ties, ties to even, and
+    onnxruntime.
+
+    Attributes:
+        report: the report of the integer reference, which rounds ties up, as the DPU does.
+        unequal: the share of onnxruntime's results that differ from the reference when that rounds
+            ties to even. It should be 0.
+        moved: the share of the results that differ between both rules, because of this operation or
+            of those before it.
+        moved_by: the largest of these differences, as a number of steps of the tensor's scale.
+    """
+
+    report: LayerReport
+    unequal: float
+    moved: float
+    moved_by: int
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """A comparison of a core's results by both rules for ties, and with onnxruntime.
+
+    Attributes:
+        layers: the comparison for each operation, in order.
+        up: the decoded result (N, C, H, W) with ties rounded up, as on the DPU.
+        even: the decoded result with ties rounded to even, as in onnxruntime.
+    """
+
+    layers: list[LayerAgreement]
+    up: np.ndarray
+    even: np.ndarray
+
+
+def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreement:
+    """Run a core by both rules for ties and in onnxruntime, and compare the results of each
+    operation.
+
+    Args:
+        core: the integer core.
+        host: the host's ONNX file of this core.
+        image: (N, C, H, W) float32 as the network reads it.
+    """
+    names = [op.output for op in core.ops]
+    session = open_session(
+        with_outputs(any_size(host), dict.fromkeys(names, onnx.TensorProto.UINT8))
+    )
+    stored = session.run(names, {session.get_inputs()[0].name: image})
+    up, reports = run_core(core, core.host_part.encode(image))
+    even, _ = run_core(core, core.host_part.encode(image), half_even=True)
+    layers = []
+    for name, report, runtime in zip(names, reports, stored, strict=True):
+        difference = np.abs(up[name] - even[name])
+        # The host's file stores int8 as uint8 around 128.
+        unequal = float((runtime.astype(np.int16) - ZERO != even[name]).mean())
+        share = float((difference > 0).mean())
+        layers.append(LayerAgreement(report, unequal, share, int(difference.max())))
+    return Agreement(layers, merged_correction(core, up), merged_correction(core, even))
+
+
+def integer_rows(
+    model: onnx.ModelProto, core: IntCore, host: onnx.ModelProto, images: Iterable[np.ndarray]
+) -> tuple[Row, ...]:
+    """Compare a core with the integer reference on a few crops, as table rows.
+
+    Args:
+        model: the float network.
+        core: the integer core.
+        host: the host's ONNX file of this core.
+        images: calibration images (1, C, H, W), a crop of the first few of which is run.
+
+    Returns:
+        A row for each integer operation, then one for the effect of the DPU's tie rounding.
+    """
+    patches = few_crops(images, model)
+    agreements = [agreement(core, host, crop) for crop in patches]
+    source = f"the integer reference on {len(agreements)} calibration patches"
+    by_layer = zip(*(one.layers for one in agreements), strict=True)
+    layers = [_layer_row(list(same), source) for same in by_layer]
+    session = open_any_size(model)
+    part = core.host_part
+    results = [
+        [to_shares(part.finish(crop, x), part.input_ranges) for x in (one.up, one.even)]
+        for crop, one in zip(patches, agreements, strict=True)
+    ]
+    in_float = [
+        to_shares(part.clip(result_of(session, crop)), part.input_ranges) for crop in patches
+    ]
+    return (*layers, _rounding_row(in_float, results, source))
+
+
+def _layer_row(layers: list[LayerAgreement], source: str) -> Row:
+    proven = layers[0].report.proven_bits
+    # AMD states no width of the accumulator; the bound on shift_bias hints at 24 bits.
+    margin = NARROW_BITS - proven
+
+    def percent(shares: Iterable[float], of: str = source) -> Figure:
+        return measured(100 * float(np.mean(list(shares))), "%", of)
+
+    figures = {
+        "accumulator, seen": measured(max(a.report.peak_bits for a in layers), "bits", source),
+        "accumulator, proven": predicted(proven, "bits", (proven, proven), BITS_SOURCE),
+        "left of 24 bits": predicted(
+            margin, "bits", (margin, margin), f"23 bits and a sign, less {BITS_SOURCE}"
+        ),
+        "saturated": percent(a.report.saturated for a in layers),
+        "ties": percent(a.report.ties for a in layers),
+        "as onnxruntime": percent(
+            (1 - a.unequal for a in layers), f"{source}, half to even as there"
+        ),
+        "moved by half up": percent((a.moved for a in layers), f"{source}, half up"),
+        "at most by": measured(max(a.moved_by for a in layers), "units", f"{source}, half up"),
+    }
+    return Row("integer layers", layers[0].report.name, figures)
+
+
+def _rounding_row(in_float: list[np.ndarray], results: list[list[np.ndarray]], source: str) -> Row:
+    """Return a row that compares both rules for ties: the DPU rounds them up, the runtime to even.
+
+    It states how far the results differ, and the error of each against the float network.
+    """
+    up, even = (np.concatenate([pair[k].ravel() for pair in results]) for k in (0, 1))
+    floats = np.concatenate([result.ravel() for result in in_float])
+
+    def mae(one: np.ndarray, other: np.ndarray) -> Figure:
+        return measured(float(np.abs(one - other).mean(dtype=np.float64)), "of full scale", source)
+
+    figures = {
+        "pixels that differ": measured(100 * float((up != even).mean()), "%", source),
+        "MAE between them": mae(up, even),
+        "MAE of half up": mae(up, floats),
+        "MAE of half to even": mae(even, floats),
+    }
+    return Row("rounding", "half up (DPU) against half to even (onnxruntime)", figures)
