@@ -110,7 +110,8 @@ def _log_network(network: Network, sensors: Mapping[str, Sensor]) -> None:
             logger.warning(warning)
     elif is_unknown(sensors):
         logger.info(
-            "network: %s, for an unknown sensor; it restores better if it is given the sensor",
+            "network: %s, for an unknown sensor: the result may be worse than the image if yours "
+            "is sharper than assumed. Name it with `sensor`",
             network.name,
         )
     else:
