@@ -160,11 +160,11 @@ def samples_of(
         ranges = None if input_range is None else read_ranges(input_range, channels)
         return read_samples(source, channels, fixed_px, multiple_px or 1, ranges)
     # Simulated patches have one channel and PATCH_PX a side.
-    if not multiple_px:
+    if fixed_px is not None and not multiple_px:
         what = f"only images of {fixed_px} x {fixed_px} pixels"
     elif channels != 1:
         what = f"{channels} channels"
-    elif PATCH_PX % multiple_px:
+    elif multiple_px and PATCH_PX % multiple_px:
         what = f"images of multiples of {multiple_px} pixels"
     else:
         return None

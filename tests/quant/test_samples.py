@@ -10,10 +10,12 @@ import pytest
 import tifffile
 from onnx import TensorProto, helper
 
-from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from beers_deploy.quant.samples.own import OwnSamples, read_samples, samples_of
 from beers_deploy.quant.samples.patches import Regenerated
+from beers_deploy.quant.tiling.receptive_field import tiling_of
+from tests.quant.simplify.networks import parsed
 
 SHAPE = (3, 2, 150, 137)
 RAMP = np.linspace(0, 1, np.prod(SHAPE), dtype=np.float32).reshape(SHAPE)
@@ -208,6 +210,19 @@ def test_networks_that_simulated_patches_do_not_suit_ask_for_samples() -> None:
         value.CopyFrom(fixed)
     with pytest.raises(OptionError, match="only images of 32 x 32 pixels"):
         samples_of(pooled, None)
+
+
+def test_a_network_that_cannot_be_tiled_is_refused_for_its_operator_and_not_for_its_size() -> None:
+    """Simulated patches suit it, so that `quantize` gets to name the operator."""
+    scale = np.ones(1, np.float32)
+    normalized = parsed(
+        "y = InstanceNormalization(x, scale, bias)",
+        "float[N,1,H,W] x => float[N,1,H,W] y",
+        constants={"scale": scale, "bias": scale},
+    )
+    with pytest.raises(ModelError):
+        tiling_of(normalized)
+    assert samples_of(normalized, None) is None
 
 
 def test_a_fault_while_a_patch_is_computed_does_not_end_a_loop() -> None:
