@@ -96,14 +96,21 @@ class Window:
 
 
 def plan_windows(recipe: DatasetRecipe) -> list[Window]:
-    """Plan every patch of a dataset, in order, or raise ImageError if a scene is too small."""
+    """Plan every patch of a dataset, in order, or raise ImageError that names all scenes which are
+    too small.
+    """
     windows: list[Window] = []
+    small: list[str] = []
     for index, path in enumerate(recipe.scenes):
         scene_windows = list(_scene_windows(recipe, index, len(windows)))
         if not scene_windows:
-            side = ((recipe.patch_px or 1) + 2 * MARGIN_PX) * recipe.oversampling
-            raise ImageError(f"{path} has less than {side} scene pixels a side. Leave it out.")
+            small.append(str(path))
         windows += scene_windows
+    if small:
+        side = ((recipe.patch_px or 1) + 2 * MARGIN_PX) * recipe.oversampling
+        raise ImageError(
+            f"Less than {side} scene pixels a side: {', '.join(small)}. Leave that out."
+        )
     return windows
 
 

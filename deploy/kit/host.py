@@ -4,8 +4,7 @@
     python3 host.py image.npy restored.npy
 
 Images are float32 (C, H, W) as the network reads them, in [0, 1] unless host.json has other
-factors. The script needs NumPy, host.json and, for the cores, onnxruntime. On a board, replace the
-runners in `cores`.
+factors. The script needs NumPy, host.json and onnxruntime; a board needs other runners in `cores`.
 
 1. Each tile goes to one core or several (`factors`, `exposed`): core.onnx restores the tile as it
    is. Where host.json has exposures, core-x4.onnx restores the dark pixels of a tile that was
@@ -20,6 +19,7 @@ runners in `cores`.
 
 from __future__ import annotations
 
+import argparse
 import itertools
 import json
 import sys
@@ -137,9 +137,7 @@ def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
 
 
 def exposed(factor: int, image: np.ndarray, run: Any) -> np.ndarray:
-    """Multiply the light of a tile (1, C, h, w) by a factor, restore it by that factor's core
-    `run`, and divide the result. The sensor's dark offset is not light and stays.
-    """
+    """Restore a tile (1, C, h, w) at `factor` times its light, without the sensor's dark offset."""
     if factor == 1:
         return restored(image, run, UNITS[1])
     dark = F(S["offset"])
@@ -194,8 +192,7 @@ def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
     blurred = sum(summed(near, row, column) for row, column in zip(rows, columns))  # noqa: B905 - as above
     blurred = blurred + around(block_means(extended(x, BLOCK * (len(far) // 2))), far)
     own = block_means(extended(raw, 0))
-    # The converter clips noise at zero, which raises the means of dark blocks. This is no error of
-    # x.
+    # The converter clips noise at zero: that raises the means of dark blocks, and is no error.
     clipped = np.interp(own, means, excess, right=0.0).astype(F)
     residual = own - np.minimum(clipped, np.maximum(own, F(0))) - blurred
     # Blocks that a saturated pixel reaches through the near part of H are left out.
@@ -396,4 +393,8 @@ def cores() -> dict[int, Any]:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2], cores())
+    parser = argparse.ArgumentParser(description="Restore an image by the network of this kit.")
+    parser.add_argument("image", help=".npy of the raw image (C, H, W)")
+    parser.add_argument("restored", help=".npy to write")
+    paths = parser.parse_args()
+    main(paths.image, paths.restored, cores())

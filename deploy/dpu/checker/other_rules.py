@@ -54,10 +54,17 @@ INSTEAD = {
     "Softmax": "leave it to the host, behind the network",
     "Erf": "use HardSwish in place of GELU; 'quantize --adapt' replaces it",
     "Gelu": "use HardSwish; 'quantize --adapt' replaces it",
+    "Elu": "train with LeakyReLU of slope 26/256, or with ReLU",
+    "Mish": "train with HardSwish",
+    "Softplus": "train with ReLU; as a part of Mish, x * Tanh(Softplus(x)), with HardSwish",
     "Clip": "use ReLU, or ReLU6 (Clip from 0 to 6)",
     "ReduceSum": "use a 1 x 1 convolution of ones",
     "ReduceMean": "use GlobalAveragePool",
     "Transpose": "keep the layout (N, C, H, W) throughout",
+    "Reshape": (
+        "leave it to the host, or do without it; around InstanceNormalization it is a part of "
+        "GroupNorm: train without normalisation"
+    ),
     "Slice": "use a convolution that picks these channels or pixels",
     "Gather": (
         "to pick fixed channels, use a 1 x 1 convolution; what is picked by value stays "

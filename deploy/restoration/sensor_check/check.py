@@ -55,9 +55,15 @@ class SensorCheck:
         """The result in words, under the key 'sensor check', for a row of results; empty if there
         was no sensor to compare with.
         """
-        is_measured = any(figure.value is not None for figure in self.figures.values())
-        words = "; ".join(self.warnings) or ("agrees" if is_measured else "not measurable")
-        return {"sensor check": words} if self.figures else {}
+        if not self.figures:
+            return {}
+        unknown = [name for name, figure in self.figures.items() if figure.value is None]
+        words = "agrees"
+        if len(unknown) == len(self.figures):
+            words = "not measurable"
+        elif unknown:
+            words = f"agrees; not measurable: {', '.join(unknown)}"
+        return {"sensor check": "; ".join(self.warnings) or words}
 
     def report(self, name: str, sensor: str, strict: bool) -> None:
         """Log a warning for each contradiction between the image and its sensor.
