@@ -106,7 +106,7 @@ def quantized(
         target: the board whose rules apply.
         finetune: the number of training steps of the integers, or "auto" to continue while they
             help.
-        effort: the effort of the search for equalization factors.
+        effort: the effort of the search for equalisation factors.
         adapts: True to replace operators that the DPU lacks by ones that it has.
         output: name of the output to retain; None if the network has only one.
 
@@ -163,7 +163,7 @@ def quantize_alone(
         target: the board whose rules apply.
         steps: the number of training steps of the integers; None to continue while they help, 0
             for none.
-        effort: the effort of the search for equalization factors.
+        effort: the effort of the search for equalisation factors.
         adapts: True to replace operators that the DPU lacks by ones that it has. The statistics
             still compare the result with the unchanged `origin`.
 
@@ -223,7 +223,7 @@ def quantize_conditioned(
             patches, of one sensor, give the statistics of each layer.
         sensor: the sensor that the result is conditioned on.
         target: the board whose rules apply.
-        effort: the effort of the search for equalization factors.
+        effort: the effort of the search for equalisation factors.
 
     Returns:
         The INT8 network for `sensor`, whose `layers` have statistics of each layer.
@@ -347,7 +347,7 @@ def family_model(
         seed: the seed of the patches.
         shifts: the bit shifts that the target's arithmetic allows.
         passes: the passes that reduce the rounding error; by default all of them.
-        effort: the effort of the search for equalization factors.
+        effort: the effort of the search for equalisation factors.
 
     Returns:
         The ONNX model for the sensor in the middle of the family. `int8_for_sensor` makes that of

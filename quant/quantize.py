@@ -6,7 +6,7 @@ file for the host out.
 3. Choose the scale of each tensor by least squares.
 4. Exclude groups in which int8 could not end at a ReLU6's six.
 5. Write a result to which nothing is added in windows.
-6. Equalize the channels of the groups, then those of the single tensors.
+6. Equalise the channels of the groups, then those of the single tensors.
 7. Round the graph, which writes its copies last, to the integer core.
 8. Train the integers and change scales, if requested.
 """
@@ -99,7 +99,7 @@ class Quantized:
         host: the INT8 network as ONNX for onnxruntime: the integer core, and the host's pre- and
             post-processing.
         core: the integer core, which the DPU computes.
-        graph: the float graph that was rounded to `core`, after the passes (equalized, with copies
+        graph: the float graph that was rounded to `core`, after the passes (equalised, with copies
             of its result).
         network: the float network before any pass, split into DPU and host part.
     """
@@ -121,10 +121,10 @@ class Plan:
             image.
         host_part: the host's pre- and post-processing.
         groups: residual groups, each a set of tensors that adds connect and that share one scale.
-        singles: tensors whose channels are equalized in addition to the groups, or without groups.
+        singles: tensors whose channels are equalised in addition to the groups, or without groups.
         shifts: the smallest and largest shifts that the target allows.
         passes: the passes that reduce the error.
-        effort: the effort of the search for equalization factors.
+        effort: the effort of the search for equalisation factors.
     """
 
     graph: Graph
@@ -136,7 +136,7 @@ class Plan:
     effort: Effort = Effort.normal
 
     def stages(self) -> list[Stage]:
-        """Return the separate searches for equalization factors, in order: the residual groups,
+        """Return the separate searches for equalisation factors, in order: the residual groups,
         then the single tensors.
 
         Effort and time of the search are estimated from them before it begins.
@@ -158,9 +158,9 @@ class Plan:
         """Round a float graph to an integer core.
 
         Args:
-            candidate: the plan's graph after some passes: equalized, or with copies of its result.
+            candidate: the plan's graph after some passes: equalised, or with copies of its result.
             frac_bits: the number of fractional bits of the scale of least squared error, for each
-                tensor by its name. Equalized tensors get GROUP_FRAC_BITS instead.
+                tensor by its name. Equalised tensors get GROUP_FRAC_BITS instead.
             earlier: convolutions that were rounded before, which are not rounded again; new ones
                 are added.
 
@@ -170,7 +170,7 @@ class Plan:
         Raises:
             ModelError: the DPU's shifts do not reach all scales.
         """
-        # Equalized tensors are scaled to fill int8 at one scale.
+        # Equalised tensors are scaled to fill int8 at one scale.
         shared = [*chain.from_iterable(self.groups), *self.singles.tensors]
         scales = {**frac_bits, **dict.fromkeys(shared, GROUP_FRAC_BITS)}
         # A coarse copy holds what a finer scale clips.
@@ -201,7 +201,7 @@ def quantize_model(
         shifts: the smallest and largest shifts that the target allows.
         tuning: the parameters of fine-tuning; None does not train the integers.
         passes: the passes that reduce the error.
-        effort: the effort of the search for equalization factors.
+        effort: the effort of the search for equalisation factors.
 
     Returns:
         The integer core, the host's ONNX file, and the float graph that was rounded.
@@ -250,7 +250,7 @@ def quantize_model(
 
 
 def _singles(graph: Graph, host_part: HostPart, groups: list[ResidualGroup]) -> SingleTensors:
-    """Return the tensors that are equalized in addition to these groups.
+    """Return the tensors that are equalised in addition to these groups.
 
     There are none if there are groups and no depthwise convolutions.
     """
@@ -262,7 +262,7 @@ def _singles(graph: Graph, host_part: HostPart, groups: list[ResidualGroup]) -> 
 
 
 def rounded(plan: Plan, images: Sequence[np.ndarray]) -> tuple[IntCore, Graph]:
-    """Carry out a plan on calibration images: choose scales, equalize, and round to integers.
+    """Carry out a plan on calibration images: choose scales, equalise, and round to integers.
 
     These are steps 3 to 7 of the module.
 
@@ -298,7 +298,7 @@ def rounded(plan: Plan, images: Sequence[np.ndarray]) -> tuple[IntCore, Graph]:
 def _equalized(
     graph: Graph, plan: Plan, frac_bits: Mapping[str, int], images: Sequence[np.ndarray]
 ) -> Graph:
-    """Equalize the channels of the groups, then those of the single tensors, and report the
+    """Equalise the channels of the groups, then those of the single tensors, and report the
     expected time before.
     """
     first_crop, *others = crops(images[0], 0 if halo_of(graph) is not None else None)
@@ -315,7 +315,7 @@ def _equalized(
     trials(graph, tensors(graph))(graph)(None)
     seconds = max((time.perf_counter() - start) * limit.runs, 1)
     logger.info(
-        "equalization tries at most %d candidates, in about %.0f s", limit.candidates, seconds
+        "equalisation tries at most %d candidates, in about %.0f s", limit.candidates, seconds
     )
     graph = _equalized_groups(graph, plan, trials, images, limit.groups)
     return _equalized_singles(graph, plan, trials, images, limit.groups)
@@ -324,13 +324,13 @@ def _equalized(
 def _equalized_groups(
     graph: Graph, plan: Plan, trials: Trials, images: Sequence[np.ndarray], most_groups: int
 ) -> Graph:
-    """Equalize one group after the other; groups that follow have a first guess until then."""
+    """Equalise one group after the other; groups that follow have a first guess until then."""
     ranges = [channel_ranges(plan.graph, group, images, plan.host_part) for group in plan.groups]
     guesses = [first_guess(group_ranges, GAMMAS[0], 1.0) for group_ranges in ranges]
     for group, guess in list(zip(plan.groups, guesses, strict=True))[1:]:
         graph = equalize(graph, group, guess)
     for number, group in enumerate(plan.groups):
-        step(f"equalizing the channels of residual group {number + 1} of {len(plan.groups)}")
+        step(f"equalising the channels of residual group {number + 1} of {len(plan.groups)}")
         # The search starts from the group as it is in the float network.
         if number:
             graph = equalize(graph, group, 1 / guesses[number])
@@ -346,13 +346,13 @@ def _equalized_groups(
 def _equalized_singles(
     graph: Graph, plan: Plan, trials: Trials, images: Sequence[np.ndarray], most_groups: int
 ) -> Graph:
-    """Equalize the single tensors.
+    """Equalise the single tensors.
 
     If the image itself is in these tensors, they are scaled such that no calibration value clips.
     """
     if not plan.singles.tensors:
         return graph
-    step(f"equalizing the channels of {len(plan.singles.tensors)} tensors")
+    step(f"equalising the channels of {len(plan.singles.tensors)} tensors")
     ranges = single_ranges(graph, plan.singles, images, plan.host_part)
     start = np.ones(len(ranges))
     factors = equalize_single(graph, plan.singles, ranges, start, trials, plan.effort, most_groups)

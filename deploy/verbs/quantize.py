@@ -85,7 +85,7 @@ def quantize(
         images: folder of scenes to simulate from; drawn scenes if none.
         patches: number of simulated patches.
         patch: side of a simulated patch in pixels.
-        effort: how thoroughly channels are equalized: fast takes first guesses, normal searches
+        effort: how thoroughly channels are equalised: fast takes first guesses, normal searches
             groups of channels for a bounded time, best searches each channel without a bound.
         finetune: number of steps that train the integers on the patches; 'auto' trains for some
             minutes, as long as the error falls.

@@ -1,4 +1,4 @@
-"""Bound the search for equalization factors, and estimate its time before it begins.
+"""Bound the search for equalisation factors, and estimate its time before it begins.
 
 1. Count the work of a candidate: the multiply-accumulates of the operations that it runs again, and
    the work of rounding and loading its weights.
@@ -20,7 +20,7 @@ from beers_deploy.quant.session import values_of
 
 
 class Effort(StrEnum):
-    """The effort of the search for equalization factors.
+    """The effort of the search for equalisation factors.
 
     - `fast`: first guesses only.
     - `normal`: groups of channels with similar ranges, within a bound of work.
@@ -105,7 +105,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Bound:
-    """The amount of work to which the search for equalization factors is limited.
+    """The amount of work to which the search for equalisation factors is limited.
 
     Attributes:
         groups: the maximum number of groups into which the channels of a tensor or residual group

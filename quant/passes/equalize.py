@@ -1,4 +1,4 @@
-"""Equalize the channels of a residual group, so that one scale suits them all, without changing the
+"""Equalise the channels of a residual group, so that one scale suits them all, without changing the
 float network.
 
 1. Multiply the weights that write channel c of the group by k_c, and divide those that read it: the
@@ -254,7 +254,7 @@ def stepped(
 
 @dataclass(frozen=True)
 class Best:
-    """The best equalization factors found so far.
+    """The best equalisation factors found so far.
 
     Attributes:
         factors: (C,) the factor of each channel.

@@ -1,4 +1,4 @@
-"""Equalize the channels of single tensors, which only convolutions write and read, without changing
+"""Equalise the channels of single tensors, which only convolutions write and read, without changing
 the float network.
 
 Each channel may be scaled by a factor of its own, as in `quant.passes.equalize`. A factor is any
@@ -76,7 +76,7 @@ def _guess(ranges: np.ndarray, weights: np.ndarray, gamma: float, headroom: floa
 
 @dataclass(frozen=True)
 class SingleTensors:
-    """Tensors that only convolutions write and read, so that each may be equalized by itself.
+    """Tensors that only convolutions write and read, so that each may be equalised by itself.
 
     They are no members of a residual group. Factors and ranges of all of them are stored in one
     array (sum of the channels,), one tensor behind the other.
@@ -151,7 +151,7 @@ class SingleTensors:
         """Return the factors with which int8 covers the same range of each tensor as at the
         tensor's own scale.
 
-        In the core all equalized tensors have GROUP_FRAC_BITS fractional bits, so a power of two
+        In the core all equalised tensors have GROUP_FRAC_BITS fractional bits, so a power of two
         makes up for the difference.
 
         Args:

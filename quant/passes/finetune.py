@@ -168,7 +168,7 @@ def finetune(
     Args:
         core: the integer core to start from.
         full: the float graph that reads the int8 planes that an image is split into, before
-            equalization.
+            equalisation.
         tuning: the training pairs, the number of steps and the learning rate.
         shifts: the smallest and largest shifts that the target allows.
 

@@ -50,7 +50,7 @@ def only(name: str) -> ResidualGroup:
 
 def residual_groups(graph: Graph) -> list[ResidualGroup]:
     """Find the residual groups: tensors that adds connect, and that can share one scale and be
-    equalized.
+    equalised.
 
     Only convolutions, adds and operations that pass channels on write and read them, with nothing
     in between that blocks a factor per channel. Groups that a product, a pixel shuffle or the
@@ -113,7 +113,7 @@ def _links(op: Op, widths: Mapping[str, int]) -> list[tuple[str, str, int]]:
 def exceeds_six(graph: Graph, group: ResidualGroup, frac_bits: Mapping[str, int]) -> bool:
     """Return True if int8 cannot end at the value 6 in a group that a ReLU6 writes to.
 
-    Equalization would let the end of int8 replace the ReLU6's clip at 6. That fails if one of the
+    Equalisation would let the end of int8 replace the ReLU6's clip at 6. That fails if one of the
     tensors needs a scale at which int8 ends beyond 6.
 
     Args:

@@ -28,7 +28,7 @@ from beers_deploy.quant.session import (
 T = TypeVar("T")
 
 SEARCH_CROPS = 16
-"""The number of crops on which equalization is searched. A quarter of them has the strongest edges,
+"""The number of crops on which equalisation is searched. A quarter of them has the strongest edges,
 where int8 clips. Small crops contain less information, so more of them are used.
 """
 MOST_CROPS = 64

@@ -234,7 +234,7 @@ def quantize_behind_bank(
         images: calibration inputs of these layers, as `bank_images` returns them.
         shifts: the smallest and largest shifts that the target allows.
         passes: the passes that reduce the error.
-        effort: the effort of the search for equalization factors.
+        effort: the effort of the search for equalisation factors.
 
     Returns:
         The core for the sensor in the middle of the range, and the biases from which it is
@@ -258,7 +258,7 @@ def map_steps(conditioned: ConditionedCore, weights: Weights) -> list[np.ndarray
     """Compute the float value that one integer step of each feature map stands for, at a gain of 1.
 
     Training uses the steps to round maps as INT8 does. A step of a channel is the scale of the map
-    over the factor by which equalization multiplied the channel, which is the ratio of integer
+    over the factor by which equalisation multiplied the channel, which is the ratio of integer
     weights to float ones.
 
     Args:

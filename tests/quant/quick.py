@@ -123,7 +123,7 @@ def changed(
 
 @contextmanager
 def one_guess() -> Iterator[None]:
-    """One guess in the place of the search that equalizes channels."""
+    """One guess in the place of the search that equalises channels."""
     guess: dict[str, Any] = {"GAMMAS": (0.5,), "HEADROOM": (1.0,)}
     with (
         patch.multiple("beers_deploy.quant.passes.equalize", STEPS=(), **guess),

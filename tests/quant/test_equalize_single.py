@@ -1,4 +1,4 @@
-"""Equalizing single tensors: the float network stays, the search only gains, most on unequal
+"""Equalising single tensors: the float network stays, the search only gains, most on unequal
 channels.
 """
 

@@ -263,4 +263,4 @@ def test_each_step_is_named(float_onnx: onnx.ModelProto, patches: Patches) -> No
     with reporting(reported.append), progress("calibrating"):
         quickly(float_onnx, patches)
     names = [step.what.removeprefix("calibrating: ") for step in reported]
-    assert [name.split(" ")[0] for name in names] == ["scale", "float", "equalizing"]
+    assert [name.split(" ")[0] for name in names] == ["scale", "float", "equalising"]

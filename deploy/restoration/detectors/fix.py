@@ -28,7 +28,7 @@ STRIP_PX = 256
 """Rows that are searched at a time."""
 WRONG_GAIN = 0.05
 """The gain error from which a single column or row is replaced. Smaller ones are left for an
-equalization to correct.
+equalisation to correct.
 """
 MANY = 0.01
 """The share of the pixels from which faults no longer count as single ones."""

@@ -194,8 +194,8 @@ def _sections(width_px: int) -> list[slice]:
 
 
 SHARPENS = "restoration about doubles it"
-EQUALIZE = "equalize the image first"
-TRAIN = "or train with the effects prnu and dsnu in the sensor's profile"
+EQUALIZE = "equalise the image first"
+TRAIN = "or use a network that was trained with the effects prnu and dsnu"
 FIX = f"`fix_detectors` {FOUND} replaces"
 ERRORS = 2.0
 """The number of standard errors in an interval of 95 %."""

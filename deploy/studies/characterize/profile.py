@@ -167,7 +167,7 @@ def _colour_consequence(colour: float) -> str:
         )
     return (
         "The profile states the stronger part. Unequal readout channels or interference cause "
-        "this: equalize the frames first, or a restoration smooths more than it need"
+        "this: equalise the frames first, or a restoration smooths more than it need"
     )
 
 

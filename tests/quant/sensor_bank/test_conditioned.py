@@ -172,7 +172,7 @@ def test_the_steps_of_maps_turn_float_weights_into_the_files(
         expected = (weight * (read_steps * 2.0**bits / stream[:, None])[:, :, None, None]).clip(
             -128, 127
         )
-        # One step of 127 is allowed. Without equalization the error would be tens of steps.
+        # One step of 127 is allowed. Without equalisation the error would be tens of steps.
         assert np.sqrt(np.square(op.weight - expected).mean()) < 1
 
 
