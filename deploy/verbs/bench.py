@@ -110,6 +110,7 @@ def bench(
     """
     options = partial(changed, bench, locals())
 
+    from beers_deploy.conditioned_file import conditioned_on
     from beers_deploy.dpu.board import boards_of
     from beers_deploy.model.raster.images import read_acquisition
     from beers_deploy.network import Network
@@ -130,7 +131,7 @@ def bench(
         refuse_without("`image`", **options("full_scale"))
     else:
         refuse_with("`image`", **options("size"))
-    source = Network.load(network, sensor=profile, int8=True)
+    source = conditioned_on(Network.load(network, sensor=profile, int8=True), profile)
     # The digests are those of the files that are read from here on.
     inputs = inputs_of(*paths)
     boards = boards_of(target)

@@ -15,6 +15,7 @@ from torch import nn
 import beers_deploy as bd
 from beers_deploy.dpu.board import boards_of, load_dpu
 from beers_deploy.model.raster.images import read_acquisition
+from beers_deploy.model.shipped import SHIPPED
 from beers_deploy.network import Network
 from beers_deploy.performance import traditional
 from beers_deploy.performance.board import Bench, Question, bench_board, boards_for
@@ -179,6 +180,17 @@ def test_the_exposures_of_an_image_are_counted_whatever_the_bits_of_the_sensor(
     assert int(shares["x1"]) > 0
     assert int(shares["x8"]) > 0
     assert int(shares["x4"]) == 0
+
+
+def test_a_file_for_every_sensor_has_the_exposures_of_its_name(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "dark.tif", np.full((128, 128), 200, np.uint16))
+    name = "convbeers-half-xs-int8"
+    notes = [
+        bd.bench(each, image=tmp_path / "dark.tif", tile=128, traditional=False).notes
+        for each in (name, SHIPPED / f"{name}.onnx")
+    ]
+    assert notes[0] == notes[1]
+    assert any("x8 100%" in note for note in notes[0])
 
 
 def test_a_curve_of_another_shape_takes_the_host_longer(network: Path) -> None:
