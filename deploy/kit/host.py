@@ -116,9 +116,7 @@ DECODINGS: dict[str, Any] = {
     "offset windows": offset_windows,
     "bank sum": bank_sum,
 }
-"""The functions that decode the copies that a core writes of each channel, by the name in
-host.json.
-"""
+"""How the copies that a core writes of each channel are decoded, by the name in host.json."""
 
 
 def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
@@ -228,9 +226,9 @@ def detail(raw: np.ndarray, near: np.ndarray) -> np.ndarray:
 def judged(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Compute the self-check of one band (H, W): two figures (2, n, m) of blocks of CHECK pixels.
 
-    The first is chi2, the mean of (raw - H x)^2 / variance of the noise, in which the means of
-    small cells count less. The second is the mean of (x - H x)^2 / variance, which shows whether a
-    wrong restoration would be detected. Both are NaN where too few pixels count.
+    The first is chi2: raw - H x, squared, over the variance that noise alone has, of single pixels
+    or of sums over small cells. The second is the mean of (x - H x)^2 / variance, which shows
+    whether a wrong restoration would be detected. Both are NaN where too few pixels count.
     """
     facts = S["self_check"]
     kernel = np.array(facts["rows"], F).T @ np.array(facts["columns"], F)
@@ -246,13 +244,15 @@ def judged(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
     inside = np.zeros_like(counts)
     inside[CLOSE:-CLOSE, CLOSE:-CLOSE] = counts[CLOSE:-CLOSE, CLOSE:-CLOSE]
     residual = inside * (raw - blurred) / np.sqrt(variance)
-    cell = facts["cell"]
-    cells = sums(residual, cell) ** 2 / np.maximum(sums(inside, cell), 1)
-    smooth = sums(cells, CHECK // cell)
-    squares = sums(residual**2, CHECK) - (1 - facts["smooth_weight"]) * smooth
+    cells, smooth = (
+        sums(sums(residual, side) ** 2 / np.maximum(sums(inside, side), 1), CHECK // side)
+        for side in (facts["cell"], facts["smooth"])
+    )
+    smooth = (1 - facts["smooth_weight"]) * smooth
+    squares = np.maximum(sums(residual**2, CHECK) - smooth, facts["cell"] ** 2 * (cells - smooth))
     change = sums(inside * (x - blurred) ** 2 / variance, CHECK)
     pixels = sums(inside, CHECK)
-    pixels[pixels < CHECK**2 // 4] = np.nan
+    pixels[pixels < CHECK**2 // 2] = np.nan
     return np.asarray(np.stack([squares, change]) / pixels)
 
 
@@ -268,7 +268,7 @@ def report(blocks: np.ndarray) -> str:
     facts = S["self_check"]
     chi2 = blocks[:, 0]
     sharpening = blocks[:, 1]
-    outside = chi2 > facts["most_chi2"]
+    outside = chi2 > facts["most_chi2"] + facts["share"] * sharpening
     decidable = outside | (sharpening >= facts["least_sharpening"])
     return (
         f"self-check: {outside.sum()} of {decidable.sum()} decidable blocks contradict the raw "

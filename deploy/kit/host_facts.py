@@ -10,6 +10,8 @@ from beers_deploy.model.self_check import (
     CELL_PX,
     LEAST_SHARPENING,
     MOST_CHI2,
+    SHARE,
+    SMOOTH_PX,
     SMOOTH_WEIGHT,
     SelfCheck,
 )
@@ -149,8 +151,10 @@ def self_check_facts(sensor: Sensor) -> Facts:
         "columns": check.columns.tolist(),
         "variances": list(check.variances),
         "cell": CELL_PX,
+        "smooth": SMOOTH_PX,
         "smooth_weight": SMOOTH_WEIGHT,
         "most_chi2": MOST_CHI2,
+        "share": SHARE,
         "least_sharpening": LEAST_SHARPENING,
     }
 

@@ -22,6 +22,7 @@ from beers_deploy.model.self_check import (
     MOST_CHI2,
     OUTSIDE,
     REACH_PX,
+    SHARE,
     SMOOTH,
     WITHIN,
     Judged,
@@ -85,7 +86,7 @@ class BlockMap:
         contradict the raw image, and the share of blocks too smooth to decide.
         """
         blocks = f"blocks of {BLOCK_PX} x {BLOCK_PX} pixels"
-        outside = f"{blocks} that are decidable: residual above {MOST_CHI2:g} times the noise"
+        outside = f"{blocks} that are decidable: differ from the raw image by more than noise"
         smooth = f"{blocks}: too smooth to show a wrong restoration"
         undecided = self.known - self.decidable
         return {
@@ -105,9 +106,8 @@ class BlockMap:
         return (
             f"fails the self-check: {self.outside} of {self.decidable} decidable blocks contradict "
             "the raw image, because they differ from it, blurred as the sensor blurs, by more than "
-            f"{MOST_CHI2:g} times the noise. Check that `sensor` acquired the image, that it was "
-            "not restored or resampled before, that the network was made for this sensor, and that "
-            "its file is intact."
+            "noise. Check that `sensor` acquired the image, that it was not restored or resampled "
+            "before, that the network was made for this sensor, and that its file is intact."
         )
 
     def require(self, name: str) -> None:
@@ -199,9 +199,9 @@ def _joined(parts: Sequence[Judged], axis: int) -> Judged:
 def write_map(path: Path, blocks: BlockMap, raster: Raster) -> None:
     """Write the result of the self-check as a GeoTIFF of float32 with one pixel for each block.
 
-    The file has two planes for each band that was checked: chi2, the mean squared difference over
-    the variance of the noise, and the state of the block (0 within the bound, 1 outside, 2 too
-    smooth to decide). Both are NaN where too few pixels are known.
+    The file has two planes for each band that was checked: chi2, by how much more the block differs
+    from the raw image than noise does, and its state (0 within the bound, 1 outside, 2 too smooth
+    to decide). Both are NaN where too few pixels are known.
 
     Args:
         path: the path of the GeoTIFF.
@@ -215,7 +215,10 @@ def write_map(path: Path, blocks: BlockMap, raster: Raster) -> None:
         planes += [judged.chi2, np.where(np.isnan(judged.chi2), np.nan, state)]
         name = raster.band_names[band] if raster.band_names else f"band {band + 1}"
         infos += [
-            BandInfo(f"{name}: chi2", tags=(("most", f"{MOST_CHI2:g}"),)),
+            BandInfo(
+                f"{name}: chi2",
+                tags=(("most", f"{MOST_CHI2:g}"), ("most_per_sharpening", f"{SHARE:g}")),
+            ),
             BandInfo(
                 f"{name}: state",
                 tags=(

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from beers_deploy.model.consistency.blocks import Placed
 from beers_deploy.model.self_check import (
     BLOCK_PX,
+    CELL_PX,
     LEAST_PX,
     LEAST_SHARPENING,
     NEAR_PX,
@@ -52,27 +53,22 @@ def noise_of(sensor: Instrument, image: np.ndarray, seed: int = 1) -> np.ndarray
     generator = np.random.default_rng(seed)
     sigma = np.vectorize(lambda signal: sigma_dn(sensor, signal))(np.round(image, -1))
     noise = sigma * generator.normal(size=image.shape)
-    # One number a pixel instead of one a column: the same variance, and little scatter in a block.
     for effect in sensor.effects.values():
         if isinstance(effect, Dsnu):
-            noise += effect.rms_dn * generator.normal(size=image.shape)
+            noise += effect.rms_dn * generator.normal(size=image.shape[1])
         elif isinstance(effect, Prnu):
-            noise += effect.rms * image * generator.normal(size=image.shape)
+            noise += effect.rms * image * generator.normal(size=image.shape[1])
         elif isinstance(effect, Striping):
             noise += effect.odd_even_dn * (0.5 - np.arange(image.shape[1]) % 2)
     return np.asarray(noise)
 
 
-@pytest.mark.parametrize(
-    "sensor",
-    [
-        *SENSORS.values(),
-        plain_sensor(prnu=Prnu(0.01), dsnu=Dsnu(8.0)),
-        plain_sensor(striping=Striping(30.0)),
-    ],
-)
+PATTERNS = (plain_sensor(prnu=Prnu(0.01), dsnu=Dsnu(8.0)), plain_sensor(striping=Striping(30.0)))
+
+
+@pytest.mark.parametrize("sensor", [*SENSORS.values(), *PATTERNS])
 def test_the_true_scene_leaves_noise_alone(sensor: Instrument) -> None:
-    """The true scene leaves a chi2 of 1 for each sensor, and no block is found outside of the
+    """The true scene leaves the chi2 of noise for each sensor, and no block is found outside of the
     bound.
 
     The bound would be of no use if blur, pattern or striping alone could pass it.
@@ -83,10 +79,14 @@ def test_the_true_scene_leaves_noise_alone(sensor: Instrument) -> None:
     raw = np.rint(image + noise_of(sensor, image))
     assert 0 < raw.min() < raw.max() < FULL_SCALE
     result = judged(SelfCheck.of(sensor, REFERENCE), raw, truth)
-    # chi2 of n pixels scatters by sqrt(2 / n); the kernel is cut, hence the rest.
-    scatter = 5 * np.sqrt(2 / LEAST_PX)
-    assert_allclose(result.chi2[np.isfinite(result.chi2)], 1, atol=scatter)
     assert not result.outside.any()
+    if sensor in PATTERNS:
+        # Patterns count for more than they leave in most blocks.
+        assert np.nanmax(result.chi2) < 1.1
+        return
+    # chi2 of n cells scatters by sqrt(2 / n).
+    scatter = 4 * np.sqrt(2 / LEAST_PX) * CELL_PX
+    assert_allclose(result.chi2[np.isfinite(result.chi2)], 1, atol=scatter)
 
 
 def test_the_scale_of_the_pixels_changes_nothing() -> None:
@@ -123,8 +123,10 @@ def test_what_is_no_restoration_of_the_image_is_found(name: str) -> None:
     assert result.outside[textured].all()
 
 
-def test_a_smooth_error_counts_a_tenth_of_a_fine_one() -> None:
-    """An offset of a deviation passes and one of four is found; a fine error of one is found."""
+def test_an_error_counts_by_its_size() -> None:
+    """An offset of one deviation passes and one of four is found. Detail as large as the cells is
+    found at half a deviation, and the finest at one and a half.
+    """
     sensor = plain_sensor()
     image = blurred(scene(), sensor)
     raw = noisy(image, sensor)
@@ -133,12 +135,20 @@ def test_a_smooth_error_counts_a_tenth_of_a_fine_one() -> None:
     right = judged(check, raw, scene()).chi2
     known = np.isfinite(right)
     assert known.any()
-    fine = np.where(np.add.outer(*map(np.arange, raw.shape)) % 2, sigma, -sigma)
-    for error, weight in ((sigma, SMOOTH_WEIGHT), (4 * sigma, SMOOTH_WEIGHT), (fine, 1.0)):
+    rows, columns = np.indices(raw.shape)
+    finest = np.where((rows + columns) % 2, sigma, -sigma)
+    cells = np.where((rows // CELL_PX + columns // CELL_PX) % 2, sigma, -sigma)
+    smooth = SMOOTH_WEIGHT * CELL_PX**2
+    for error, weight in (
+        (sigma, smooth),
+        (4 * sigma, smooth),
+        (0.5 * cells, CELL_PX**2),
+        (1.5 * finest, 1.0),
+    ):
         result = judged(check, raw + error, scene())
         expected = weight * np.square(error / sigma).mean()
-        assert_allclose(result.chi2[known] - right[known], expected, rtol=0.1, atol=0.06)
-        assert result.outside[known].all() == (expected > 0.5)
+        assert_allclose(result.chi2[known] - right[known], expected, rtol=0.2, atol=0.2)
+        assert result.outside[known].all() == (expected > 2)
 
 
 def test_a_broken_block_is_found_where_it_is() -> None:
