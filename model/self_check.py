@@ -157,6 +157,7 @@ class SelfCheck:
         kernel = kernel + (1 - kernel.sum()) / kernel.size
         left, values, right = np.linalg.svd(kernel)
         terms = np.count_nonzero(values > LEAST_TERM * values[0])
+        # A column's pattern adds up over the rows of a cell. Its few columns scatter, hence the 2.
         return cls(
             rows=(left[:, :terms] * values[:terms]).T.astype(np.float32),
             columns=right[:terms].astype(np.float32),
