@@ -167,6 +167,7 @@ def model_card(name: str, recipe: NetworkRecipe, toml: str, images: Sequence[Pat
     attribution = "".join(f"- {line}\n" for line in recipe.attribution)
     notes = "".join(f"{line}\n\n" for line in recipe.notes)
     patches = sum(stage.steps * stage.batch for stage in recipe.stages)
+    folders = " ".join(f"--images {folder.resolve().name}/" for folder in images)
     return f"""# {name}
 
 {described(variant)} behind the bank of its sensor: one set of weights and one INT8 file for \
@@ -174,7 +175,7 @@ every sensor in range.
 
 **Made by**
 
-    beers-deploy train --recipe {name} --images aerial/ --out runs/{name}
+    beers-deploy train --recipe {name} {folders} --out runs/{name}
 
 on {processor_name()} with PyTorch {torch.__version__}: {patches} patches of {len(photos)} \
 photographs, whose list of names and digests has the SHA-256 `{data[:16]}`, and {recipe.charts} \

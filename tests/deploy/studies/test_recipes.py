@@ -78,6 +78,7 @@ def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes
     assert RECIPE.strip() in card
     assert "- Drawn for a test, CC0 1.0" in card
     assert "10 patches of 1 photographs" in card
+    assert f"--images {folders[0].name}/ --images {folders[1].name}/ --out" in card
     trained = read_tensors(out / "1-float" / "convbeers-half-xs.safetensors")[1]["recipe"]
     assert isinstance(trained, dict)
     assert trained["held_out"] == ["town_1.png"]
