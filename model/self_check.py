@@ -13,16 +13,16 @@ reference and no model of a fault is needed.
    spread evenly.
 2. Divide the residual by the deviation of the noise at the light of H x.
 3. Sum over cells of CELL_PX. The blur has removed most of the finer detail from H x, so that finer
-   parts of the residual are mostly noise, which hides an error where it counts.
+   parts of the residual are mostly noise, which would hide an error.
 4. Average over blocks of BLOCK_PX, without pixels whose residual is unknown: missing and saturated
    ones, those close to one, and those at the image's border. The smooth part of a residual is its
    mean in squares of SMOOTH_PX.
 
 Noise alone has a chi2 of about 1, and a correct restoration usually less, because it retains a part
 of the noise. `sharpening`, the mean of (x - H x)^2 / variance(y), states what the restoration
-changed. The errors of a correct restoration grow with it, and so does the bound: MOST_CHI2 + SHARE
-of the sharpening. A chi2 beyond it means that the sensor would not show x as y. Reasons are another
-network's file, a broken tile or a flipped weight.
+changed. The errors of a correct restoration grow with it, and so does the bound: MOST_CHI2 +
+MOST_PER_SHARPENING x sharpening. A chi2 beyond it means that the sensor would not show x as y.
+Reasons are another network's file, a broken tile or a flipped weight.
 
 If the scene is smooth, a wrong restoration changes little. If the sharpening is below
 LEAST_SHARPENING, a block within the bound is no evidence: it is not decidable.
@@ -53,8 +53,8 @@ the radius (measured on a drawn scene of 480 DN rms).
 """
 
 CELL_PX = 4
-"""Side of the cells whose sums are judged. By single pixels alone, 2 and not 26 of 68 blocks were
-found that a flipped weight cost 0.5 to 2 dB (measured on training places).
+"""Side of the cells whose sums are judged. Of 68 blocks that lose 0.5 to 2 dB by a
+flipped weight 26 are found, and 2 if single pixels are judged alone (measured on training places).
 """
 
 SMOOTH_PX = 16
@@ -78,10 +78,10 @@ LEAST_PX = BLOCK_PX**2 // 2
 """A block with fewer pixels that count has no chi2."""
 
 MOST_CHI2 = 1.3
-SHARE = 0.01
-"""The bound of chi2 is MOST_CHI2 + SHARE times the sharpening. Of 4845 blocks, under 15 sensors, at
-three radiances and by five shipped networks, none reached 0.8 of it (measured on training places).
-Noise alone passes MOST_CHI2 at four deviations in a whole block.
+MOST_PER_SHARPENING = 0.01
+"""The bound of chi2 is MOST_CHI2 + MOST_PER_SHARPENING x sharpening. Of 4845 blocks, under 15
+sensors, at three radiances and by five shipped networks, none reached 0.8 of it (measured on
+training places). Noise alone passes MOST_CHI2 at four deviations in a whole block.
 """
 
 LEAST_SHARPENING = 40.0
@@ -111,7 +111,7 @@ class Judged:
     @property
     def outside(self) -> NDArray[np.bool_]:
         """Return True for each block whose residual is more than noise."""
-        return np.asarray(self.chi2 > MOST_CHI2 + SHARE * self.sharpening)
+        return np.asarray(self.chi2 > MOST_CHI2 + MOST_PER_SHARPENING * self.sharpening)
 
     @property
     def decidable(self) -> NDArray[np.bool_]:
@@ -157,7 +157,8 @@ class SelfCheck:
         kernel = kernel + (1 - kernel.sum()) / kernel.size
         left, values, right = np.linalg.svd(kernel)
         terms = np.count_nonzero(values > LEAST_TERM * values[0])
-        # A column's pattern adds up over the rows of a cell. Its few columns scatter, hence the 2.
+        # A column's pattern adds up over the rows of a cell. The factor of 2 allows for the scatter
+        # of chi2 over the few columns of a block.
         return cls(
             rows=(left[:, :terms] * values[:terms]).T.astype(np.float32),
             columns=right[:terms].astype(np.float32),

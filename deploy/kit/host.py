@@ -268,7 +268,7 @@ def report(blocks: np.ndarray) -> str:
     facts = S["self_check"]
     chi2 = blocks[:, 0]
     sharpening = blocks[:, 1]
-    outside = chi2 > facts["most_chi2"] + facts["share"] * sharpening
+    outside = chi2 > facts["most_chi2"] + facts["most_per_sharpening"] * sharpening
     decidable = outside | (sharpening >= facts["least_sharpening"])
     return (
         f"self-check: {outside.sum()} of {decidable.sum()} decidable blocks contradict the raw "

@@ -10,7 +10,7 @@ from beers_deploy.model.self_check import (
     CELL_PX,
     LEAST_SHARPENING,
     MOST_CHI2,
-    SHARE,
+    MOST_PER_SHARPENING,
     SMOOTH_PX,
     SMOOTH_WEIGHT,
     SelfCheck,
@@ -154,7 +154,7 @@ def self_check_facts(sensor: Sensor) -> Facts:
         "smooth": SMOOTH_PX,
         "smooth_weight": SMOOTH_WEIGHT,
         "most_chi2": MOST_CHI2,
-        "share": SHARE,
+        "most_per_sharpening": MOST_PER_SHARPENING,
         "least_sharpening": LEAST_SHARPENING,
     }
 

@@ -20,9 +20,9 @@ from beers_deploy.model.self_check import (
     BLOCK_PX,
     LEAST_SHARPENING,
     MOST_CHI2,
+    MOST_PER_SHARPENING,
     OUTSIDE,
     REACH_PX,
-    SHARE,
     SMOOTH,
     WITHIN,
     Judged,
@@ -199,9 +199,9 @@ def _joined(parts: Sequence[Judged], axis: int) -> Judged:
 def write_map(path: Path, blocks: BlockMap, raster: Raster) -> None:
     """Write the result of the self-check as a GeoTIFF of float32 with one pixel for each block.
 
-    The file has two planes for each band that was checked: chi2, by how much more the block differs
-    from the raw image than noise does, and its state (0 within the bound, 1 outside, 2 too smooth
-    to decide). Both are NaN where too few pixels are known.
+    The file has two planes for each band that was checked: chi2, the squared difference from the
+    raw image over that of noise alone, and the state of the block (0 within the bound, 1 outside, 2
+    too smooth to decide). Both are NaN where too few pixels are known.
 
     Args:
         path: the path of the GeoTIFF.
@@ -217,7 +217,10 @@ def write_map(path: Path, blocks: BlockMap, raster: Raster) -> None:
         infos += [
             BandInfo(
                 f"{name}: chi2",
-                tags=(("most", f"{MOST_CHI2:g}"), ("most_per_sharpening", f"{SHARE:g}")),
+                tags=(
+                    ("most", f"{MOST_CHI2:g}"),
+                    ("most_per_sharpening", f"{MOST_PER_SHARPENING:g}"),
+                ),
             ),
             BandInfo(
                 f"{name}: state",
