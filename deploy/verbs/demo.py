@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from beers_deploy.model.shipped import INT8, SENSOR, VARIANT
+from beers_deploy.profiles.errors import optional
 from beers_deploy.verbs.check import check
 from beers_deploy.verbs.gate import gate
 from beers_deploy.verbs.parameters import Holds, InputPath, OutputFolder, Progress, Seed, SensorLike
@@ -51,9 +52,12 @@ def demo(
     Raises:
         ImageError: an image that cannot be read.
         OptionError: a sensor of other than 12 bits.
-        MissingExtraError: torch or matplotlib is not installed.
+        MissingExtraError: torch, scikit-image or matplotlib is not installed.
     """
     refuse_without("`image`", full_scale=full_scale is not None and image is None)
+    # What the last steps need is asked for before the first writes.
+    for package in ("skimage", "matplotlib"):
+        optional(package, "demo")
     # These load torch.
     import numpy as np
 

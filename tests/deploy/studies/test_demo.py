@@ -1,3 +1,4 @@
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -5,7 +6,8 @@ import onnx
 import pytest
 import tifffile
 
-from beers_deploy.profiles.errors import OptionError
+import beers_deploy as bd
+from beers_deploy.profiles.errors import MissingExtraError, OptionError
 from beers_deploy.profiles.shipped import HERE, board_names
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.studies.demo import load_sensors, read_input
@@ -44,6 +46,16 @@ def test_the_demo_takes_a_raw_image_through_the_whole_chain(
     boards = [row for row in document["rows"] if row["table"] == "boards"]
     assert [row["name"].split()[0] for row in boards] == board_names()
     assert "no power of vek280 under its DPU is published" in page
+
+
+@pytest.mark.parametrize("package", ["skimage", "matplotlib"])
+def test_a_missing_package_is_named_before_anything_is_written(
+    package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(MissingExtraError, match=rf"{package}.*pip install 'beers-deploy\["):
+        bd.demo(out=tmp_path / "out")
+    assert not list(tmp_path.rglob("*.*"))
 
 
 @pytest.mark.slow
