@@ -6,7 +6,7 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Union
 
@@ -15,7 +15,7 @@ import onnx
 import onnxruntime as ort
 
 from beers_deploy.float_onnx import float_model, require_tile
-from beers_deploy.model.exposure import brightened, factors_for
+from beers_deploy.model.exposure import UNCHANGED, Exposure, exposures_for
 from beers_deploy.model.shipped import INT8, SENSOR, VARIANT, shipped_names
 from beers_deploy.network_files import (
     Conditioned,
@@ -154,7 +154,12 @@ class Network:
 
     @classmethod
     def for_sensor(
-        cls, weights: Conditioned | ConditionedFile, sensor: Sensor, *, int8: bool
+        cls,
+        weights: Conditioned | ConditionedFile,
+        sensor: Sensor,
+        *,
+        int8: bool,
+        exposure: Exposure = UNCHANGED,
     ) -> "Network":
         """Compute the network of one sensor from weights that serve every sensor.
 
@@ -163,6 +168,7 @@ class Network:
                 from the sensor's blur and noise.
             sensor: the sensor profile. If a value is a range, its middle is used.
             int8: True for the INT8 network, False for float32.
+            exposure: the factor by which pixels are multiplied before the network.
 
         Returns:
             The network, whose filters suit this sensor only.
@@ -172,7 +178,7 @@ class Network:
                 file.
         """
         name = f"{weights.name}{INT8}" if int8 else weights.name
-        return cls(weights.model(sensor, int8), name, weights=weights, profile=sensor)
+        return cls(weights.model(sensor, int8, exposure), name, weights=weights, profile=sensor)
 
     def with_output(self, name: str | None) -> "Network":
         """Return the network reduced to one of its outputs.
@@ -199,19 +205,15 @@ class Network:
     def exposures(self) -> Mapping[int, "Network"]:
         """The networks for dark pixels, each under its exposure factor, an integer above 1.
 
-        An image multiplied by a factor looks like one of a sensor with that factor of gain, so each
-        network is conditioned on such a sensor. `restore` multiplies dark pixels, runs the network
-        of the factor, and divides the result. The mapping is empty if the network is not
-        conditioned on a sensor, or if the sensor's noise allows no factor.
+        `restore` multiplies dark pixels, runs the network of the factor, and divides the result.
+        There are none for a network of no sensor, or if the sensor's noise allows no factor.
         """
         if self.weights is None or self.profile is None:
             return {}
         int8 = self.precision == "int8"
-        return {
-            factor: Network.for_sensor(self.weights, brightened(self.profile, factor), int8=int8)
-            for factor in factors_for(self.profile.nominal())
-            if factor > 1
-        }
+        exposed = partial(Network.for_sensor, self.weights, self.profile, int8=int8)
+        exposures = exposures_for(self.profile.nominal(), int8=int8)
+        return {one.factor: exposed(exposure=one) for one in exposures}
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the network as an ONNX file, atomically, and return the path of the file."""

@@ -15,6 +15,7 @@ import onnx
 from beers_deploy.float_onnx import float_for
 from beers_deploy.model.bank import network_bank
 from beers_deploy.model.departure import departure
+from beers_deploy.model.exposure import UNCHANGED, Exposure, brightened
 from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.io.tensors import is_conditioned, read_conditioned
 from beers_deploy.model.shipped import (
@@ -62,19 +63,20 @@ class Conditioned:
         """The method by which the filters of the first layer are reduced to 7 x 7 pixels."""
         return read_conditioned(self.weights).kernels
 
-    def model(self, sensor: Sensor, int8: bool) -> onnx.ModelProto:
+    def model(self, sensor: Sensor, int8: bool, exposure: Exposure = UNCHANGED) -> onnx.ModelProto:
         """Compute the ONNX model for a sensor.
 
         Args:
             sensor: the sensor, of which the middle of each range is used.
             int8: True for INT8, False for float32.
+            exposure: the factor by which pixels are multiplied before the network.
 
         Raises:
             ModelError: INT8 is requested for weights that are not shipped. Only a shipped network
                 has a known INT8 file.
         """
         if not int8:
-            return float_for(self.weights, self.name, sensor)
+            return float_for(self.weights, self.name, brightened(sensor, exposure.told))
         shipped = SHIPPED / f"{self.name}{INT8}.onnx"
         if self.weights.parent != SHIPPED:
             raise ModelError(
@@ -82,7 +84,7 @@ class Conditioned:
                 f"every sensor with 'beers-deploy quantize {self.weights} --out "
                 f"{self.name}{INT8}.onnx'."
             )
-        return int8_for_sensor(load_onnx(shipped), sensor)
+        return int8_for_sensor(load_onnx(shipped), sensor, exposure)
 
 
 @dataclass(frozen=True)
@@ -104,9 +106,14 @@ class ConditionedFile:
         """The method by which the filters of the first layer are reduced to 7 x 7 pixels."""
         return required_conditioned_core(self.stored).kernels
 
-    def model(self, sensor: Sensor, int8: bool) -> onnx.ModelProto:  # noqa: ARG002 - always INT8
+    def model(
+        self,
+        sensor: Sensor,
+        int8: bool,  # noqa: ARG002 - always INT8
+        exposure: Exposure = UNCHANGED,
+    ) -> onnx.ModelProto:
         """Compute the INT8 model for a sensor, of which the middle of each range is used."""
-        return int8_for_sensor(self.stored, sensor)
+        return int8_for_sensor(self.stored, sensor, exposure)
 
 
 def conditioned(path: Path) -> Conditioned | None:
@@ -213,7 +220,10 @@ def other_sensor(model: onnx.ModelProto, sensor: Sensor) -> str:
 
 
 def int8_for_sensor(
-    model: onnx.ModelProto, sensor: Sensor, more: Mapping[str, str] | None = None
+    model: onnx.ModelProto,
+    sensor: Sensor,
+    exposure: Exposure = UNCHANGED,
+    more: Mapping[str, str] | None = None,
 ) -> onnx.ModelProto:
     """Condition an INT8 network on another sensor.
 
@@ -224,6 +234,7 @@ def int8_for_sensor(
         model: an INT8 network that `quantize` made from sensor-conditioned weights, for whichever
             sensor.
         sensor: the new sensor, of which the middle of each range is used.
+        exposure: the factor by which pixels are multiplied before the network.
         more: metadata to write in addition to that of `model`.
 
     Returns:
@@ -233,9 +244,12 @@ def int8_for_sensor(
         ModelError: `model` cannot be conditioned on a sensor.
     """
     stored = required_conditioned_core(model)
-    instrument = sensor.nominal()
+    instrument = brightened(sensor, exposure.told).nominal()
     core = stored.for_sensor(
-        network_bank(instrument, stored.kernels), sensor_vector(instrument).values
+        network_bank(instrument, stored.kernels),
+        sensor_vector(instrument).values,
+        exposure.finer,
+        instrument.offset_dn / instrument.max_dn,
     )
     return host_model(
         core, {**metadata(model), "sensor": sensor.name, **(more or {})}, fixed_tile_px(model)

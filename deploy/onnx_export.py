@@ -9,7 +9,7 @@ import onnx
 from beers_deploy import __version__
 from beers_deploy.float_onnx import about, float_for, require_tile, to_onnx
 from beers_deploy.kit.board_file import save_core
-from beers_deploy.model.exposure import brightened, factors_for
+from beers_deploy.model.exposure import UNCHANGED, Exposure, exposures_for
 from beers_deploy.model.io.files import whole_file, write_text
 from beers_deploy.model.io.tensors import is_conditioned, read_conditioned, read_plain
 from beers_deploy.model.shipped import SENSOR, SHIPPED
@@ -137,7 +137,7 @@ def export_int8(
         save_core(for_board, core_file, target)
 
 
-def delta_files(delta: Path, sensor: SensorLike) -> dict[int, Path]:
+def delta_files(delta: Path, sensor: SensorLike) -> dict[Exposure, Path]:
     """Name the delta files of a sensor, which hold the filters and biases that suit it.
 
     `restore` multiplies dark pixels by an exposure factor, and each factor needs filters of its
@@ -148,31 +148,29 @@ def delta_files(delta: Path, sensor: SensorLike) -> dict[int, Path]:
         sensor: the sensor, whose noise decides which factors can be used.
 
     Returns:
-        The path of each delta, by its factor.
+        The path of each delta, by its exposure.
     """
-    files = {1: delta}
-    for factor in factors_for(Sensor.load(sensor).nominal()):
-        if factor > 1:
-            files[factor] = delta.with_name(f"{delta.stem}-x{factor}{delta.suffix}")
+    files = {UNCHANGED: delta}
+    for exposure in exposures_for(Sensor.load(sensor).nominal(), int8=True):
+        files[exposure] = delta.with_name(f"{delta.stem}-x{exposure.factor}{delta.suffix}")
     return files
 
 
-def save_delta(model: onnx.ModelProto, sensor: SensorLike, factor: int, delta: Path) -> None:
+def save_delta(model: onnx.ModelProto, sensor: SensorLike, exposure: Exposure, delta: Path) -> None:
     """Write the delta of an INT8 network: the filters, biases and factor that suit one sensor.
 
     Args:
         model: the INT8 network, conditioned on `sensor`.
         sensor: the sensor.
-        factor: the exposure factor. Above 1, the delta is that of a sensor with this factor of
-            gain.
+        exposure: the factor by which pixels are multiplied before the network.
         delta: the file to write.
 
     Raises:
         ModelError: the network cannot be conditioned on a sensor.
     """
-    profile = Sensor.load(sensor)
-    exposed = model if factor == 1 else int8_for_sensor(model, brightened(profile, factor))
-    packed = delta_of_file(exposed)
+    if exposure != UNCHANGED:
+        model = int8_for_sensor(model, Sensor.load(sensor), exposure)
+    packed = delta_of_file(model)
     with whole_file(delta) as temporary:
         temporary.write_bytes(packed)
     logger.info("wrote %s: %d bytes", delta, len(packed))

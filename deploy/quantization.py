@@ -233,7 +233,7 @@ def quantize_conditioned(
     """
     images = [] if calibration.images is None else [calibration.images]
     family = family_model(network, images, calibration.seed, _shifts_of(target), effort=effort)
-    host = int8_for_sensor(family, sensor, {"target": target.name})
+    host = int8_for_sensor(family, sensor, more={"target": target.name})
     layers = integer_rows(origin.model, read_core(host), host, calibration.drawn.degraded)
     return Network(host, f"{network.name}-int8", origin=origin, layers=layers)
 

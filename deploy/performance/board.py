@@ -19,7 +19,7 @@ from beers_deploy.dpu.cost.latency import Prediction
 from beers_deploy.dpu.cost.own_runs import read_own_runs
 from beers_deploy.dpu.reading import own_tile_px
 from beers_deploy.model.departure import has_other_curve
-from beers_deploy.model.exposure import factors_for
+from beers_deploy.model.exposure import exposures_for
 from beers_deploy.network import Network
 from beers_deploy.performance.swath import PAPER_SIZE, Swath, parse_size, predict_network
 from beers_deploy.performance.tables import (
@@ -179,9 +179,10 @@ def bench_board(
     if dn is not None and sensor is not None:
         plan = make_plan((1, height_px, width_px), tile_px, halo_px, tiling)
         # `dn` is in 0..MAX_DN whatever the bits of the sensor.
-        counts = tiles_by_factor(
-            dn, plan, factors_for(sensor.nominal()), MAX_DN, offset_of(sensor, MAX_DN)
-        )
+        # The board runs the network in INT8.
+        exposures = exposures_for(sensor.nominal(), int8=True)
+        factors = (1, *(exposure.factor for exposure in exposures))
+        counts = tiles_by_factor(dn, plan, factors, MAX_DN, offset_of(sensor, MAX_DN))
         # A tile with bright and dark pixels runs once for each exposure that its pixels ask for.
         swath = replace(swath, runs=sum(counts.values()) / plan.tiles)
     targets = list({dpu.target.name: dpu.target for dpu in asked.boards}.values())

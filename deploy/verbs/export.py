@@ -101,6 +101,6 @@ def export(
         return Path(out)
     model = conditioned_int8(path, sensor or SENSOR, path_or_none(apply))
     export_int8(model, Path(out), tile, core, board, c_file)
-    for factor, file in deltas.items():
-        save_delta(model, sensor or SENSOR, factor, file)
+    for exposure, file in deltas.items():
+        save_delta(model, sensor or SENSOR, exposure, file)
     return Path(out)

@@ -7,6 +7,11 @@ All weights and scales behind the bank are the same for every sensor. The inputs
 body are finer by the sensor's gain (`Bank.gain`). Its biases are therefore multiplied by it, and
 the unit of the result is divided by it, because ReLU and sums pass a positive factor on. The
 filters of a sensor, its unit and the biases are computed in milliseconds.
+
+A dark image may be multiplied by more than the sensor's gain says (`model.exposure.Exposure`). The
+planes of the filters are then larger by this factor by themselves, and the biases are multiplied by
+it as well. Only the image itself has steps about the middle of full scale, so that a constant is
+missing from it, which the biases behind the bank make up for.
 """
 
 import json
@@ -22,12 +27,13 @@ from numpy.typing import NDArray
 from beers_deploy.model.bank import Bank
 from beers_deploy.model.variants import SENSOR_VALUES, Kernels
 from beers_deploy.profiles.errors import ModelError, reason_of
+from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, Shifts, quantize_bias
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import PLANES, Op
 from beers_deploy.quant.host_part import BankSum
 from beers_deploy.quant.onnx_file import metadata
-from beers_deploy.quant.sensor_bank.filters import BITS, integer_bank
+from beers_deploy.quant.sensor_bank.filters import BITS, IMAGE_STEP_DN, integer_bank
 from beers_deploy.quant.untrusted import DAMAGE, contradictions
 
 WEIGHTS = "weights_sha256"
@@ -67,24 +73,32 @@ class ConditionedCore:
         # Only behind fitted kernels does the analytic restoration have a coarse copy.
         return "fitted" if self.core.host_part.decoding == BankSum(coarse_copies=1) else "cut"
 
-    def for_sensor(self, bank: Bank, vector: Sequence[float]) -> IntCore:
+    def for_sensor(
+        self, bank: Bank, vector: Sequence[float], finer: int = 1, offset: float = 0.0
+    ) -> IntCore:
         """Return the core for one sensor: its filters, its biases and the unit of its result.
 
         Args:
             bank: the filters of the sensor.
             vector: (4,) the sensor vector: MTF across and along the track and noise at two
                 brightnesses, each scaled to [-1, 1].
+            finer: the factor by which images are brighter than the sensor makes them.
+            offset: the pixel value that the sensor stores without light, as a share of full scale.
         """
         gain = bank.gain
         # ReLU and sums pass a positive factor on, so of the body only biases grow.
-        values = gain * np.array([1.0, *vector])
-        ops = tuple(self._conditioned(op, bank, values) for op in self.core.ops)
+        values = finer * gain * np.array([1.0, *vector])
+        # A body that is `finer` times as large would read finer (x - 1/2) of the image x. The
+        # brighter image is finer (x - offset) + offset, and the bank subtracts 1/2 from it.
+        missing = (finer - 1) * (offset - 0.5)
+        image_steps = gain * missing * MAX_DN / IMAGE_STEP_DN
+        ops = tuple(self._conditioned(op, bank, values, image_steps) for op in self.core.ops)
         # The host takes the gain off again; in float32, as its file stores the unit.
         unit = float(np.float32(bank.unit / gain))
         return replace(self.core, ops=ops, host_part=replace(self.core.host_part, unit=unit))
 
     def _conditioned(
-        self, op: IntConv | Op, bank: Bank, values: NDArray[np.float64]
+        self, op: IntConv | Op, bank: Bank, values: NDArray[np.float64], image_steps: float
     ) -> IntConv | Op:
         if isinstance(op, IntConv) and op.input == PLANES:
             return bank_layer(bank, self.core.host_part.place_px, self.shifts, self.kernels)
@@ -93,7 +107,12 @@ class ConditionedCore:
         terms = self.biases[op.name]
         product = op.weight_frac_bits + self.core.frac_bits[op.input]
         # Only the convolution behind the bank has a term for each of the sensor's values.
-        bias, bits = quantize_bias(terms @ values[: terms.shape[1]], product, self.shifts)
+        real = terms @ values[: terms.shape[1]]
+        if op.input == BANK:
+            # The image comes first among the bank's channels, one for each pixel of a place.
+            image = op.weight[:, : self.core.host_part.place_px**2].sum((1, 2, 3), dtype=np.int64)
+            real += image_steps * image * 2.0 ** -(op.weight_frac_bits + BITS)
+        bias, bits = quantize_bias(real, product, self.shifts)
         return replace(op, bias=bias, bias_frac_bits=bits)
 
     def biases_to_json(self) -> str:

@@ -118,7 +118,7 @@ SMALL = "convbeers-xs-int8"
 
 @pytest.mark.parametrize(
     ("sensor", "factors"),
-    [("pleiades-degraded", [4, 8]), ("dior-medium", [2, 4]), ("dior-high", [])],
+    [("pleiades-degraded", [4, 16]), ("dior-medium", [2, 8]), ("dior-high", [2])],
 )
 def test_the_deltas_of_exposures_make_the_networks_that_restore_runs(
     sensor: str, factors: list[int], tmp_path: Path
@@ -153,7 +153,7 @@ def test_the_files_of_exposures_are_refused_before_any_work(tmp_path: Path) -> N
     """
     sensor = own_sensor(tmp_path).rename(tmp_path / "my-x4.toml")
     before = sensor.read_bytes()
-    out = tmp_path / "my-x8.onnx"
+    out = tmp_path / "my-x16.onnx"
     words = f"export --network {SMALL} --out {out} --delta"
     assert "an input of this run" in refused(f"{words} {tmp_path}/my.toml --sensor {sensor}")
     assert "another output" in refused(f"{words} {tmp_path}/my.onnx")

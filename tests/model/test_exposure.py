@@ -10,14 +10,20 @@ from numpy.typing import NDArray
 
 from beers_deploy.model.exposure import (
     FACTORS,
+    FINEST,
     HEADROOM,
+    INTEGER_FACTORS,
+    INTEGER_NOISE,
+    INTEGER_STEP,
     MOST_FACTORS,
     NOISE_BEYOND,
+    TOLD_NOISE_BEYOND,
     brightened,
     choose_factors,
+    exposures_for,
     factors_for,
+    noise_excess,
 )
-from beers_deploy.model.family import RANGES, sensor_values
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
 
@@ -30,16 +36,6 @@ def noisier(times: float) -> Instrument:
     return replace(NOMINAL, alpha=NOMINAL.alpha * times**2, beta=NOMINAL.beta * times**2)
 
 
-def excess_of(sensor: Instrument, factor: int) -> float:
-    """How far the noise lies above what training saw, at so many times the gain: 1 is at the end of
-    the range.
-    """
-    values = sensor_values(
-        replace(sensor, gain_dn_per_radiance=sensor.gain_dn_per_radiance * factor)
-    )
-    return max(values[key] / RANGES[key][1] for key in ("sigma_dark", "sigma_bright"))
-
-
 @given(st.floats(0.05, 20))
 def test_factors_begin_with_1_rise_and_stay_within_training(times: float) -> None:
     factors = factors_for(noisier(times))
@@ -48,9 +44,9 @@ def test_factors_begin_with_1_rise_and_stay_within_training(times: float) -> Non
     assert set(factors) <= {1, *FACTORS}
     assert len(factors) <= 1 + MOST_FACTORS
     sensor = noisier(times)
-    assert all(excess_of(sensor, factor) <= NOISE_BEYOND for factor in factors[1:])
+    assert all(noise_excess(sensor, factor) <= NOISE_BEYOND for factor in factors[1:])
     if factors[-1] < max(FACTORS):
-        assert excess_of(sensor, 2 * factors[-1]) > NOISE_BEYOND
+        assert noise_excess(sensor, 2 * factors[-1]) > NOISE_BEYOND
 
 
 @pytest.mark.parametrize(
@@ -59,6 +55,36 @@ def test_factors_begin_with_1_rise_and_stay_within_training(times: float) -> Non
 )
 def test_the_factors_of_shipped_sensors(name: str, factors: tuple[int, ...]) -> None:
     assert factors_for(Sensor.load(name).nominal()) == factors
+
+
+@given(st.floats(0.05, 20))
+def test_an_integer_network_is_told_what_training_knew_and_finer_by_the_rest(times: float) -> None:
+    """A network is told as much of a factor as its training range allows. The highest factor is the
+    largest at which the noise is not too much, and the lower one is INTEGER_STEP times smaller.
+    """
+    sensor = noisier(times)
+    exposures = exposures_for(sensor, int8=True)
+    factors = [exposure.factor for exposure in exposures]
+    assert set(factors) <= set(INTEGER_FACTORS)
+    for exposure in exposures:
+        assert exposure.told * exposure.finer == exposure.factor
+        assert exposure.told == 1 or noise_excess(sensor, exposure.told) <= TOLD_NOISE_BEYOND
+        if exposure.finer > 1:
+            assert exposure.finer <= FINEST
+            assert noise_excess(sensor, exposure.factor) <= INTEGER_NOISE
+            assert exposure.told == 8 or noise_excess(sensor, 2 * exposure.told) > TOLD_NOISE_BEYOND
+    highest = max(factors, default=1)
+    if highest < max(INTEGER_FACTORS) and all(exposure.finer < FINEST for exposure in exposures):
+        assert noise_excess(sensor, 2 * highest) > INTEGER_NOISE
+    if len(factors) > 1:
+        assert factors == [factors[1] // INTEGER_STEP, factors[1]]
+
+
+@given(st.floats(0.05, 20))
+def test_a_float_network_is_told_the_whole_factor(times: float) -> None:
+    exposures = exposures_for(noisier(times), int8=False)
+    assert all(exposure.finer == 1 for exposure in exposures)
+    assert (1, *(exposure.factor for exposure in exposures)) == factors_for(noisier(times))
 
 
 @pytest.mark.parametrize("factor", FACTORS)

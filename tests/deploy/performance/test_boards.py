@@ -167,7 +167,7 @@ def test_the_exposures_of_an_image_are_counted_whatever_the_bits_of_the_sensor(
     sensor = sensor.replace(bits=bits, gain_dn_per_radiance=gain)
     # These pixels are too bright for x4, unless full scale is that of 14 bits.
     pixels = np.full((128, 256), 2000, np.uint16)
-    # These pixels are dark enough for x8, also far from bright ground.
+    # These pixels are dark enough for x16, also far from bright ground.
     pixels[:, :128] = 200
     tifffile.imwrite(tmp_path / "image.tif", pixels)
     boards, _ = boards_for(boards_of("vck190"), None, None)
@@ -175,10 +175,10 @@ def test_the_exposures_of_an_image_are_counted_whatever_the_bits_of_the_sensor(
     dn = read_acquisition(tmp_path / "image.tif", 4095, None)
     result = bench_board(Network.load(network), asked, dn, sensor)
     (words,) = (note for note in result.notes if "by exposure" in note)
-    shares = dict(re.findall(r"(x\d) (\d+)%", words))
-    assert shares.keys() == {"x1", "x4", "x8"}
+    shares = dict(re.findall(r"(x\d+) (\d+)%", words))
+    assert shares.keys() == {"x1", "x4", "x16"}
     assert int(shares["x1"]) > 0
-    assert int(shares["x8"]) > 0
+    assert int(shares["x16"]) > 0
     assert int(shares["x4"]) == 0
 
 
@@ -190,7 +190,7 @@ def test_a_file_for_every_sensor_has_the_exposures_of_its_name(tmp_path: Path) -
         for each in (name, SHIPPED / f"{name}.onnx")
     ]
     assert notes[0] == notes[1]
-    assert any("x8 100%" in note for note in notes[0])
+    assert any("x16 100%" in note for note in notes[0])
 
 
 def test_a_curve_of_another_shape_takes_the_host_longer(network: Path) -> None:

@@ -186,7 +186,7 @@ def test_the_command_reports_which_steps_were_taken(
     figures = row["figures"]
     assert (CONSISTENCY in figures, BRIGHTENED in figures) == (consistency, exposure)
     assert row["text"]["consistency"] == ("on" if consistency else "off")
-    assert row["text"].get("exposures") == ("x1, x4, x8" if exposure else None)
+    assert row["text"].get("exposures") == ("x1, x4, x16" if exposure else None)
     if exposure:
         # These pixels have none above 614 DN within the receptive radius.
         share = 100 * (BRIGHT_FROM - RADIUS_PX) / SHAPE[1]
