@@ -202,18 +202,18 @@ class Network:
         return self if name is None else replace(self, model=model)
 
     @cached_property
-    def exposures(self) -> Mapping[int, "Network"]:
-        """The networks for dark pixels, each under its exposure factor, an integer above 1.
+    def exposures(self) -> Mapping[float, "Network"]:
+        """The networks for dark pixels and strong edges, each under its exposure factor.
 
-        `restore` multiplies dark pixels, runs the network of the factor, and divides the result.
-        There are none for a network of no sensor, or if the sensor's noise allows no factor.
+        `restore` multiplies such pixels, runs the network of the factor, and divides the result.
+        There are none for a network of no sensor, nor in float32 if the noise allows no factor.
         """
         if self.weights is None or self.profile is None:
             return {}
         int8 = self.precision == "int8"
         exposed = partial(Network.for_sensor, self.weights, self.profile, int8=int8)
-        exposures = exposures_for(self.profile.nominal(), int8=int8)
-        return {one.factor: exposed(exposure=one) for one in exposures}
+        every = exposures_for(self.profile.nominal(), int8=int8)
+        return {each.factor: exposed(exposure=each) for each in every if each != UNCHANGED}
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the network as an ONNX file, atomically, and return the path of the file."""

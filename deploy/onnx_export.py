@@ -140,8 +140,8 @@ def export_int8(
 def delta_files(delta: Path, sensor: SensorLike) -> dict[Exposure, Path]:
     """Name the delta files of a sensor, which hold the filters and biases that suit it.
 
-    `restore` multiplies dark pixels by an exposure factor, and each factor needs filters of its
-    own.
+    `restore` multiplies dark pixels and strong edges by an exposure factor, and each factor needs
+    biases of its own.
 
     Args:
         delta: the file for the factor 1. The other names add the factor, such as NAME-x4.delta.
@@ -152,7 +152,9 @@ def delta_files(delta: Path, sensor: SensorLike) -> dict[Exposure, Path]:
     """
     files = {UNCHANGED: delta}
     for exposure in exposures_for(Sensor.load(sensor).nominal(), int8=True):
-        files[exposure] = delta.with_name(f"{delta.stem}-x{exposure.factor}{delta.suffix}")
+        if exposure != UNCHANGED:
+            name = f"{delta.stem}-x{exposure.factor:g}{delta.suffix}"
+            files[exposure] = delta.with_name(name)
     return files
 
 

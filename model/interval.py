@@ -32,11 +32,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beers_deploy.model.family import sensor_values
+from beers_deploy.model.family import noise_over_full_scale
 from beers_deploy.model.levels import LEVELS, Level
 from beers_deploy.model.self_check import noise_variances
+from beers_deploy.model.simulator.mtf import mtf, sensor_mtf
 from beers_deploy.profiles.errors import ModelError, OptionError, printable, reason_of
 from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.response import NYQUIST
 from beers_deploy.profiles.toml import parse_json
 
 Array = NDArray[np.float64]
@@ -63,7 +65,10 @@ SAMPLE_PX = 1 << 14
 """Pixels of one acquisition at most: more of them say little, because neighbours are alike."""
 
 LEAST_MTF = 0.001
-"""A response may have no contrast at Nyquist, which has no logarithm."""
+"""A response may have no contrast at a frequency, which has no logarithm."""
+
+CURVE_FREQUENCIES = np.linspace(0, NYQUIST, 17)[None]
+"""The frequencies in cycles per pixel, (1, K), at which a sensor's MTF is read."""
 
 MOST_EXPONENT = 5.0
 MOST_QUANTILE = 1e3
@@ -377,11 +382,15 @@ def _centred(values: Array, weight: Array) -> Array:
 
 
 def _logarithms(sensor: Instrument) -> tuple[float, float]:
-    """Return m and n of a sensor: ln(MTF / MIDDLE_MTF), the mean of both axes, and ln(noise /
-    MIDDLE_NOISE).
+    """Return m and n of a sensor: twice the mean of ln(MTF / MTF of the middle sensor) over the
+    frequencies up to Nyquist and both axes, and ln(noise / MIDDLE_NOISE).
+
+    For a curve exp(-gamma f) sinc f, m is ln(MTF / MIDDLE_MTF) at Nyquist.
     """
-    values = sensor_values(sensor)
-    mtf = math.sqrt(values["mtf_across"] * values["mtf_along"])
-    return math.log(max(mtf, LEAST_MTF) / MIDDLE_MTF), math.log(
-        values["sigma_bright"] / MIDDLE_NOISE
-    )
+    zero = np.zeros((1, 1))
+    along = sensor_mtf(zero, CURVE_FREQUENCIES.T, sensor).ravel()
+    across = sensor_mtf(CURVE_FREQUENCIES, zero, sensor).ravel()
+    contrast = np.maximum(np.abs([across, along]), LEAST_MTF)
+    middle = mtf(CURVE_FREQUENCIES, zero, MIDDLE_MTF)
+    noise = noise_over_full_scale(sensor)
+    return 2 * float(np.log(contrast / middle).mean()), math.log(noise / MIDDLE_NOISE)

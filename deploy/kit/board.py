@@ -14,7 +14,7 @@ from beers_deploy.kit.golden import PICTURE, save_array, write_golden
 from beers_deploy.kit.host_facts import host_facts
 from beers_deploy.kit.record import require_library, write_record
 from beers_deploy.model.consistency.step import REACH_PX
-from beers_deploy.model.exposure import HEADROOM
+from beers_deploy.model.exposure import HEADROOM, SHARPEST
 from beers_deploy.model.io.files import write_text
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.network_files import other_sensor
@@ -98,11 +98,11 @@ class Board(TargetProfile):
         if record:
             require_library()
         core = network.core(self, tile)
-        brighter = {} if profile is None else network.exposures
-        facts = host_facts(network, tile, profile, brighter)
+        exposed = {} if profile is None else network.exposures
+        facts = host_facts(network, tile, profile, exposed)
         core.save(folder / "core.onnx")
-        for factor, other in brighter.items():
-            other.core(self, tile).save(folder / f"core-x{factor}.onnx")
+        for factor, other in exposed.items():
+            other.core(self, tile).save(folder / f"core-x{factor:g}.onnx")
         # The compiler of an NPU reads its configuration next to the core.
         if self.npu:
             save_config(folder / "core.onnx", *self.npu["device"].value)
@@ -124,6 +124,7 @@ class Board(TargetProfile):
             "tile": tile,
             "reach": REACH_PX,
             "headroom": HEADROOM,
+            "sharpest": SHARPEST,
         }
         write_text(folder / "README.md", README.read_text(encoding="utf-8").format(**words))
         return folder

@@ -7,8 +7,7 @@ Images are float32 (C, H, W) as the network reads them, in [0, 1] unless host.js
 factors. The script needs NumPy, host.json and onnxruntime; a board needs other runners in `cores`.
 
 1. Each tile goes to one core or several (`factors`, `exposed`): core.onnx restores the tile as it
-   is. Where host.json has exposures, core-x4.onnx restores the dark pixels of a tile that was
-   multiplied by 4, and so on.
+   is. Where host.json has exposures, core-x4.onnx restores dark pixels, multiplied by 4, and so on.
 2. Around a core (`restored`), the host encodes the tile as int8 planes, decodes the core's result
    and adds it to the tile.
 3. After the last tile, the consistency step (`consistent`) makes the restored image agree with the
@@ -29,20 +28,18 @@ from typing import Any
 import numpy as np
 
 F = np.float32
+HERE = Path(__file__).parent
 CHECK = 64
 CLOSE = 16
-"""Pixels: the side of a block of the self-check (CHECK), and the distance (CLOSE) from a saturated
-pixel or the border within which no pixel counts.
-"""
-HERE = Path(__file__).parent
 BLOCK = 8
 FINE = 2
 NEAR = 8
-"""Pixels: the side of a block of the consistency step (BLOCK) and of its part for finer detail
-(FINE), and the radius of the near part of its blur (NEAR).
+"""Pixels: the sides of blocks of the self-check (CHECK), and of the consistency step (BLOCK, FINE);
+the radius of its near blur (NEAR), and the distance of the self-check from saturation (CLOSE).
 """
 S = json.loads((HERE / "host.json").read_text(encoding="utf-8"))
-UNITS = {1: S["unit"], **{int(factor): unit for factor, unit in S["exposures"].items()}}
+DARK = F(S["offset"])
+UNITS = {1.0: S["unit"], **{float(factor): unit for factor, unit in S["exposures"].items()}}
 """The unit of each core's result, by the factor that the core's tile is multiplied by."""
 
 
@@ -55,9 +52,8 @@ def shuffled(x: np.ndarray, r: int, up: bool) -> np.ndarray:
     if up:
         c = c // r**2
         return x.reshape(c, r, r, h, w).transpose(0, 3, 1, 4, 2).reshape(1, c, h * r, w * r)
-    h = h // r
-    w = w // r
-    return x.reshape(c, h, r, w, r).transpose(0, 2, 4, 1, 3).reshape(1, c * r**2, h, w)
+    squares = x.reshape(c, h // r, r, w // r, r).transpose(0, 2, 4, 1, 3)
+    return squares.reshape(1, c * r**2, h // r, w // r)
 
 
 def encoded(image: np.ndarray) -> np.ndarray:
@@ -134,32 +130,37 @@ def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
     return shuffled(value, S["last"], up=True)
 
 
-def exposed(factor: int, image: np.ndarray, run: Any) -> np.ndarray:
+def exposed(factor: float, image: np.ndarray, run: Any) -> np.ndarray:
     """Restore a tile (1, C, h, w) at `factor` times its light, without the sensor's dark offset."""
     if factor == 1:
         return restored(image, run, UNITS[1])
-    dark = F(S["offset"])
-    brighter = np.clip((image - dark) * F(factor) + dark, 0, F(1))
-    return (restored(brighter, run, UNITS[factor]) - dark) / F(factor) + dark
+    multiplied = np.clip((image - DARK) * F(factor) + DARK, 0, F(1))
+    result = np.clip(restored(multiplied, run, UNITS[factor]), 0, F(1))
+    return np.asarray(np.clip((result - DARK) / F(factor) + DARK, 0, F(1)))
 
 
 def factors(tile: np.ndarray) -> np.ndarray:
     """Choose the exposure, a factor of brightness, of every pixel (h, w) of a tile (1, C, h, w).
 
     A pixel gets the largest factor at which no pixel within the network's receptive radius exceeds
-    `headroom`.
+    `headroom`, or differs from its neighbours by more than `sharpest`; or else the smallest one.
     """
-    choice = np.ones(tile.shape[2:], int)
-    if len(UNITS) == 1:
-        return choice
-    dark = F(S["offset"])
-    brightest = brightest_around(tile[0, 0], S["halo_px"])
-    for factor in sorted(UNITS)[1:]:
-        choice[(brightest - dark) * F(factor) + dark <= F(S["headroom"])] = factor
+    smallest, *others = sorted(UNITS)
+    choice = np.full(tile.shape[2:], smallest)
+    pixels = tile[0, 0]
+    third = np.full(3, 1 / 3, F)
+    sharp = np.abs(pixels - summed(np.pad(pixels, 1, "edge"), third, third, 1))
+    sharpest = largest_around(sharp, S["halo_px"] - 1)
+    brightest = largest_around(pixels, S["halo_px"]) - DARK
+    for factor in others:
+        suits = sharpest * F(factor) <= F(S["sharpest"])
+        if factor > 1:
+            suits &= brightest * F(factor) + DARK <= F(S["headroom"])
+        choice[suits] = factor
     return choice
 
 
-def brightest_around(pixels: np.ndarray, radius: int) -> np.ndarray:
+def largest_around(pixels: np.ndarray, radius: int) -> np.ndarray:
     """Compute the maximum of the square of `radius` pixels around each pixel (h, w)."""
     size = 2 * radius + 1
     # The maximum of a square is that of its columns' maxima: first down, then across.
@@ -240,7 +241,7 @@ def judged(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
     light = np.maximum(blurred - S["offset"], 0)
     variance = dark + growth * light + square * light**2
     # Saturated pixels, those close to one, and those at the image's border have no residual.
-    counts = brightest_around((raw >= 1).astype(F), CLOSE) == 0
+    counts = largest_around((raw >= 1).astype(F), CLOSE) == 0
     inside = np.zeros_like(counts)
     inside[CLOSE:-CLOSE, CLOSE:-CLOSE] = counts[CLOSE:-CLOSE, CLOSE:-CLOSE]
     residual = inside * (raw - blurred) / np.sqrt(variance)
@@ -266,8 +267,7 @@ def sums(values: np.ndarray, side: int) -> np.ndarray:
 def report(blocks: np.ndarray) -> str:
     """Count the blocks that contradict the raw image, in a sentence; blocks (bands, 2, n, m)."""
     facts = S["self_check"]
-    chi2 = blocks[:, 0]
-    sharpening = blocks[:, 1]
+    chi2, sharpening = np.moveaxis(blocks, 1, 0)
     outside = chi2 > facts["most_chi2"] + facts["most_per_sharpening"] * sharpening
     decidable = outside | (sharpening >= facts["least_sharpening"])
     return (
@@ -343,7 +343,7 @@ def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
     ]
 
 
-def main(source: str, target: str, runs: dict[int, Any]) -> None:
+def main(source: str, target: str, runs: dict[float, Any]) -> None:
     """Restore the image in `source` into `target`, tile by tile; `runs` has each factor's core."""
     image = np.load(source).astype(F)
     t = S["tile_px"]
@@ -376,7 +376,7 @@ def main(source: str, target: str, runs: dict[int, Any]) -> None:
         sys.stdout.write(report(blocks))
 
 
-def cores() -> dict[int, Any]:
+def cores() -> dict[float, Any]:
     """Open the core of each exposure factor in onnxruntime; a board has other runners instead."""
     import onnxruntime as ort
 
@@ -384,8 +384,8 @@ def cores() -> dict[int, Any]:
     plain = ort.SessionOptions()
     plain.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
 
-    def opened(factor: int) -> Any:
-        name = "core.onnx" if factor == 1 else f"core-x{factor}.onnx"
+    def opened(factor: float) -> Any:
+        name = "core.onnx" if factor == 1 else f"core-x{factor:g}.onnx"
         session = ort.InferenceSession(str(HERE / name), plain, providers=["CPUExecutionProvider"])
         return lambda planes: session.run(None, {"planes": planes})[0]
 

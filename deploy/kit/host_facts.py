@@ -5,7 +5,7 @@ the consistency step.
 from collections.abc import Mapping
 
 from beers_deploy.model.consistency.step import Consistency
-from beers_deploy.model.exposure import HEADROOM
+from beers_deploy.model.exposure import HEADROOM, SHARPEST
 from beers_deploy.model.self_check import (
     CELL_PX,
     LEAST_SHARPENING,
@@ -32,7 +32,7 @@ def host_facts(
     network: Network,
     tile_px: int,
     sensor: Sensor | None = None,
-    brighter: Mapping[int, Network] | None = None,
+    exposed: Mapping[float, Network] | None = None,
 ) -> Facts | None:
     """Compute the content of host.json, from which a kit's `host.py` runs the host part.
 
@@ -43,8 +43,8 @@ def host_facts(
         network: the INT8 network.
         tile_px: side of a tile in pixels.
         sensor: the sensor that acquires the images; None omits the steps around the network.
-        brighter: the networks for dark pixels, by the exposure factor by which pixels are
-            multiplied before the network; None for none.
+        exposed: the networks for dark pixels and strong edges, by the exposure factor by which
+            pixels are multiplied before the network; None for none.
 
     Returns:
         The constants by name, as JSON can hold them; None if `host.py` cannot compute the host part
@@ -54,7 +54,7 @@ def host_facts(
         OptionError: the sensor would change nothing.
     """
     facts = host_constants(network, tile_px)
-    others = brighter or {}
+    others = exposed or {}
     step = consistency_facts(network, sensor) if sensor is not None and facts is not None else None
     if sensor is not None and step is None and not others:
         raise OptionError(
@@ -68,10 +68,11 @@ def host_facts(
     return {
         **facts,
         "exposures": {
-            str(factor): _unit(facts, other, tile_px) for factor, other in others.items()
+            f"{factor:g}": _unit(facts, other, tile_px) for factor, other in others.items()
         },
-        # The headroom and the offset decide which factor a pixel gets, as shares of full scale.
+        # These three decide which factor a pixel gets, as shares of full scale.
         "headroom": HEADROOM,
+        "sharpest": SHARPEST,
         "offset": instrument.offset_dn / instrument.max_dn if instrument else 0.0,
         "consistency": step,
         "self_check": None if sensor is None or step is None else self_check_facts(sensor),
@@ -124,11 +125,11 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
     }
 
 
-def _unit(facts: Facts, brighter: Network, tile_px: int) -> object:
+def _unit(facts: Facts, exposed: Network, tile_px: int) -> object:
     """Return the unit of the network for another exposure. Nothing else of the host part may
     differ.
     """
-    own = host_constants(brighter, tile_px)
+    own = host_constants(exposed, tile_px)
     assert own is not None  # noqa: S101 - the same network for another sensor
     assert {**own, UNIT: None} == {**facts, UNIT: None}  # noqa: S101 - host.json has one value for all exposures
     return own[UNIT]

@@ -175,13 +175,13 @@ def bench_board(
     swath = Swath(
         width_px, height_px, tile_px, halo_px, consistency=takes_step, detail=takes_detail
     )
-    counts = dict[int, int]()
+    counts = dict[float, int]()
     if dn is not None and sensor is not None:
         plan = make_plan((1, height_px, width_px), tile_px, halo_px, tiling)
         # `dn` is in 0..MAX_DN whatever the bits of the sensor.
         # The board runs the network in INT8.
         exposures = exposures_for(sensor.nominal(), int8=True)
-        factors = (1, *(exposure.factor for exposure in exposures))
+        factors = [exposure.factor for exposure in exposures]
         counts = tiles_by_factor(dn, plan, factors, MAX_DN, offset_of(sensor, MAX_DN))
         # A tile with bright and dark pixels runs once for each exposure that its pixels ask for.
         swath = replace(swath, runs=sum(counts.values()) / plan.tiles)
@@ -271,11 +271,11 @@ def fitted_words(rows: Sequence[Row]) -> list[str]:
     return [f"fitted range of {'; '.join(names)}: {words}" for words, names in ranges.items()]
 
 
-def exposure_words(counts: Mapping[int, int]) -> list[str]:
+def exposure_words(counts: Mapping[float, int]) -> list[str]:
     """Describe how often a network runs at each exposure.
 
     Args:
-        counts: the number of runs by exposure factor, by which dark pixels are multiplied.
+        counts: the number of runs by exposure factor, by which pixels are multiplied.
 
     Returns:
         A list of one sentence with the shares; empty if there are fewer than two factors.
@@ -283,7 +283,7 @@ def exposure_words(counts: Mapping[int, int]) -> list[str]:
     if len(counts) < 2:
         return []
     total = sum(counts.values())
-    shares = ", ".join(f"x{factor} {count / total:.0%}" for factor, count in counts.items())
+    shares = ", ".join(f"x{factor:g} {count / total:.0%}" for factor, count in counts.items())
     how = "runs of the network by exposure (measured on the image's pixels)"
     return [f"{how}: {shares}; one tile may need several"]
 

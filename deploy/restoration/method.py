@@ -26,7 +26,7 @@ Restore = Callable[[np.ndarray], np.ndarray]
 def network_method(
     model: onnx.ModelProto,
     max_dn: int,
-    brighter: Mapping[int, onnx.ModelProto],
+    exposed: Mapping[float, onnx.ModelProto],
     sensor: Instrument | None = None,
     reference: Instrument | None = None,
     plan_of: Callable[[tuple[int, ...]], Plan] | None = None,
@@ -37,8 +37,8 @@ def network_method(
     Args:
         model: the network.
         max_dn: the largest digital number, which is 1.0 to the network.
-        brighter: the same network for sensors of higher gain, by the factor of the gain. They
-            restore dark parts of an image; empty to omit that.
+        exposed: the same network for pixels that are multiplied by a factor, by the factor. They
+            restore dark parts and strong edges; empty to omit that.
         sensor: the sensor that acquired the images; None omits the consistency step, which makes
             the result agree with the raw image at low spatial frequencies.
         reference: the sensor that the restoration aims at; None omits the consistency step, too.
@@ -54,10 +54,10 @@ def network_method(
     """
     infer, _ = open_runtime("onnxruntime", model, threads=0)
     tiling = tiling_of(model)
-    # Bright images ask for no factor above 1.
+    # Few images ask for every factor.
     at_first_call = {
         factor: AtFirstCall(partial(open_runtime, "onnxruntime", other, 0))
-        for factor, other in brighter.items()
+        for factor, other in exposed.items()
     }
     offset = sensor.offset_dn if sensor else 0.0
     network = ExposedNetwork({1: infer, **at_first_call}, tiling.halo_px, offset)

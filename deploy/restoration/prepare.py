@@ -259,7 +259,7 @@ class NetworkPipeline:
         text = {"halo": plan.halo_words, "consistency": words}
         if any(others):
             factors = sorted(set(chain([1], *others)))
-            text["exposures"] = ", ".join(f"x{factor}" for factor in factors)
+            text["exposures"] = ", ".join(f"x{factor:g}" for factor in factors)
         text["runtime"] = runtime
         if self.engine.scheduler:
             text["workers"] = self.engine.scheduler

@@ -35,8 +35,8 @@ class Around:
     Attributes:
         consistency: True to make the result agree with the raw image at low spatial frequencies
             (the consistency step).
-        exposure: True to restore dark parts of the image at a higher exposure: they are multiplied
-            by a factor before the network and divided by it afterwards.
+        exposure: True to restore dark parts of the image, and strong edges, at exposures of their
+            own: they are multiplied by a factor before the network and divided by it afterwards.
     """
 
     consistency: bool = True
@@ -46,16 +46,15 @@ class Around:
 BOTH: Around = Around()
 
 
-def exposures_of(network: Network, around: Around) -> Mapping[int, Network]:
-    """Return the versions of a network that restore dark parts of an image at a higher exposure.
+def exposures_of(network: Network, around: Around) -> Mapping[float, Network]:
+    """Return the versions of a network for pixels that are multiplied by a factor before it.
 
     Args:
         network: a network. Only one that is conditioned on its sensor may have such versions.
         around: the steps that the user chooses.
 
     Returns:
-        The networks for sensors of higher gain, by the factor of the gain; empty if the network has
-        none, or the user omits exposure.
+        The networks by the factor; empty if the network has none, or the user omits exposure.
     """
     return network.exposures if around.exposure else {}
 
@@ -81,8 +80,8 @@ def exposed_networks(
     full_scale: float,
     opened: Callable[[onnx.ModelProto], Infer],
 ) -> tuple[ExposedNetwork, ...]:
-    """Open the networks of a run, each with its versions for higher exposures, where dark parts of
-    the image are multiplied by a factor before the network.
+    """Open the networks of a run, each with its versions for other exposures, where parts of the
+    image are multiplied by a factor before the network.
 
     Args:
         networks: one network for all bands, or one for each.

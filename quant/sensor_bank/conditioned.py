@@ -74,7 +74,7 @@ class ConditionedCore:
         return "fitted" if self.core.host_part.decoding == BankSum(coarse_copies=1) else "cut"
 
     def for_sensor(
-        self, bank: Bank, vector: Sequence[float], finer: int = 1, offset: float = 0.0
+        self, bank: Bank, vector: Sequence[float], finer: float = 1, offset: float = 0.0
     ) -> IntCore:
         """Return the core for one sensor: its filters, its biases and the unit of its result.
 
@@ -82,7 +82,7 @@ class ConditionedCore:
             bank: the filters of the sensor.
             vector: (4,) the sensor vector: MTF across and along the track and noise at two
                 brightnesses, each scaled to [-1, 1].
-            finer: the factor by which images are brighter than the sensor makes them.
+            finer: the factor by which images are multiplied beyond the gain of the sensor.
             offset: the pixel value that the sensor stores without light, as a share of full scale.
         """
         gain = bank.gain

@@ -118,23 +118,23 @@ SMALL = "convbeers-xs-int8"
 
 @pytest.mark.parametrize(
     ("sensor", "factors"),
-    [("pleiades-degraded", [4, 16]), ("dior-medium", [2, 8]), ("dior-high", [2])],
+    [("pleiades-degraded", [0.5, 4, 16]), ("dior-medium", [0.5, 2, 8]), ("dior-high", [0.5, 2])],
 )
 def test_the_deltas_of_exposures_make_the_networks_that_restore_runs(
-    sensor: str, factors: list[int], tmp_path: Path
+    sensor: str, factors: list[float], tmp_path: Path
 ) -> None:
     """To the byte, applied to the INT8 file of another sensor."""
     words = f"export --network {SMALL} --out {tmp_path}/x.onnx"
     output = done(f"{words} --sensor {sensor} --delta {tmp_path}/my.delta")
     expected = Network.load(SMALL, sensor=sensor).exposures
     assert sorted(expected) == factors
-    names = ["my.delta", *(f"my-x{factor}.delta" for factor in factors)]
+    names = ["my.delta", *(f"my-x{factor:g}.delta" for factor in factors)]
     assert sorted(path.name for path in tmp_path.glob("*.delta")) == sorted(names)
     for name in names:
         assert f"{name}: {(tmp_path / name).stat().st_size} bytes" in output.replace("\n", "")
     for factor in factors:
-        delta = tmp_path / f"my-x{factor}.delta"
-        applied = tmp_path / f"x{factor}.onnx"
+        delta = tmp_path / f"my-x{factor:g}.delta"
+        applied = tmp_path / f"x{factor:g}.onnx"
         assert delta.stat().st_size < 3000
         done(f"export --network {SMALL} --apply {delta} --out {applied}")
         assert applied.read_bytes() == expected[factor].save(tmp_path / "e.onnx").read_bytes()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from beers_deploy.model.exposure import (
@@ -17,7 +18,9 @@ from beers_deploy.model.exposure import (
     INTEGER_STEP,
     MOST_FACTORS,
     NOISE_BEYOND,
+    SHARPEST,
     TOLD_NOISE_BEYOND,
+    UNCHANGED,
     brightened,
     choose_factors,
     exposures_for,
@@ -63,7 +66,9 @@ def test_an_integer_network_is_told_what_training_knew_and_finer_by_the_rest(tim
     largest at which the noise is not too much, and the lower one is INTEGER_STEP times smaller.
     """
     sensor = noisier(times)
-    exposures = exposures_for(sensor, int8=True)
+    dimmed, unchanged, *exposures = exposures_for(sensor, int8=True)
+    assert (dimmed.factor, dimmed.told) == (0.5, 1)
+    assert unchanged == UNCHANGED
     factors = [exposure.factor for exposure in exposures]
     assert set(factors) <= set(INTEGER_FACTORS)
     for exposure in exposures:
@@ -77,14 +82,14 @@ def test_an_integer_network_is_told_what_training_knew_and_finer_by_the_rest(tim
     if highest < max(INTEGER_FACTORS) and all(exposure.finer < FINEST for exposure in exposures):
         assert noise_excess(sensor, 2 * highest) > INTEGER_NOISE
     if len(factors) > 1:
-        assert factors == [factors[1] // INTEGER_STEP, factors[1]]
+        assert factors == [factors[1] / INTEGER_STEP, factors[1]]
 
 
 @given(st.floats(0.05, 20))
 def test_a_float_network_is_told_the_whole_factor(times: float) -> None:
     exposures = exposures_for(noisier(times), int8=False)
     assert all(exposure.finer == 1 for exposure in exposures)
-    assert (1, *(exposure.factor for exposure in exposures)) == factors_for(noisier(times))
+    assert tuple(exposure.factor for exposure in exposures) == factors_for(noisier(times))
 
 
 @pytest.mark.parametrize("factor", FACTORS)
@@ -115,27 +120,35 @@ sides = st.integers(1, 60)
 
 
 @settings(max_examples=60)
-@given(st.integers(0, 999), sides, sides, st.integers(0, 9), st.sampled_from([0.0, 120.0]))
+@given(st.integers(0, 999), sides, sides, st.integers(1, 9), st.sampled_from([0.0, 120.0]))
 def test_a_pixel_takes_the_highest_factor_that_leaves_headroom(
     seed: int, height: int, width: int, radius_px: int, offset: float
 ) -> None:
-    """By a loop over pixels; so HEADROOM holds everywhere within the radius."""
+    """By a loop over pixels; so HEADROOM and SHARPEST hold everywhere within the radius, unless a
+    pixel gets the smallest factor.
+    """
     image = image_of(seed, height, width)
-    factors = (1, 4, 8)
+    factors = (0.5, 1, 4, 8)
     selected = choose_factors(image, factors, radius_px, FULL_SCALE, offset)
+    near = sliding_window_view(np.pad(image, 1, "edge"), (3, 3)).mean((2, 3), dtype=np.float64)
+    sharp = np.abs(image - near)
     for row, column in np.random.default_rng(seed).integers(0, (height, width), (20, 2)):
         around = image[max(row - radius_px, 0) : row + radius_px + 1, max(column - radius_px, 0) :]
         brightest = float(around[:, : min(column, radius_px) + radius_px + 1].max())
+        reach_px = radius_px - 1
+        edges = sharp[max(row - reach_px, 0) : row + radius_px, max(column - reach_px, 0) :]
+        sharpest = float(edges[:, : min(column, reach_px) + radius_px].max())
         fitting = [
             factor
-            for factor in factors
-            if (brightest - offset) * factor + offset <= HEADROOM * FULL_SCALE
+            for factor in factors[1:]
+            if (factor == 1 or (brightest - offset) * factor + offset <= HEADROOM * FULL_SCALE)
+            and sharpest * factor <= SHARPEST * FULL_SCALE
         ]
-        assert selected[row, column] == max(fitting, default=1)
+        assert selected[row, column] == max(fitting, default=0.5)
 
 
 @settings(max_examples=60)
-@given(st.data(), st.integers(0, 999), sides, sides, st.integers(0, 9))
+@given(st.data(), st.integers(0, 999), sides, sides, st.integers(1, 9))
 def test_a_part_chooses_as_the_whole_image_does(
     data: st.DataObject, seed: int, height: int, width: int, radius_px: int
 ) -> None:

@@ -21,7 +21,7 @@ Inner = tuple[slice, slice]
 class Exposed(NamedTuple):
     """The result of restoring the window of one tile at the exposures that its pixels need.
 
-    An exposure is a factor by which dark pixels are multiplied before the network and divided
+    An exposure is a factor by which pixels are multiplied before the network, and divided
     afterwards.
 
     Attributes:
@@ -37,20 +37,20 @@ class Exposed(NamedTuple):
 
 @dataclass(frozen=True)
 class ExposedNetwork:
-    """A network that restores bright pixels as they are, and dark ones at a higher exposure.
+    """A network that restores dark pixels, and pixels at strong edges, at an exposure of their own.
 
-    For a higher exposure, pixels are multiplied by a factor, restored by a version of the network
-    for a sensor of so much higher gain, and divided by the factor.
+    For it, pixels are multiplied by a factor, restored by a version of the network for such images,
+    and divided by the factor.
 
     Attributes:
         infers: the versions of the network, ready to run, by the factor. The factor 1 is among
             them, and alone if the network has no others.
-        radius_px: the network's receptive radius. The brightest pixel within it decides which
-            factor a pixel gets.
+        radius_px: the network's receptive radius. The pixels within it decide which factor a pixel
+            gets.
         offset: the pixel value that the sensor stores without light, which is not multiplied.
     """
 
-    infers: Mapping[int, Infer]
+    infers: Mapping[float, Infer]
     radius_px: int = 0
     offset: float = 0.0
 
@@ -81,7 +81,8 @@ class ExposedNetwork:
                 )
             return Exposed(restored[inside], 1, 0)
         image = np.asarray(window[0], np.float32)
-        choice = choose_factors(image, self.infers, self.radius_px, full_scale, self.offset)[inner]
+        rising = sorted(self.infers)
+        choice = choose_factors(image, rising, self.radius_px, full_scale, self.offset)[inner]
         pixels = np.zeros((1, *choice.shape), np.float32)
         factors = np.unique(choice).tolist()
         for factor in factors:
@@ -89,7 +90,7 @@ class ExposedNetwork:
             pixels = np.where(choice == factor, restored, pixels)
         return Exposed(pixels, len(factors), int((choice > 1).sum()))
 
-    def _at(self, factor: int, image: np.ndarray, full_scale: float) -> np.ndarray:
+    def _at(self, factor: float, image: np.ndarray, full_scale: float) -> np.ndarray:
         """Restore an image (h, w) at one factor, and return its pixels, (1, h, w), divided by the
         factor again.
         """
@@ -98,23 +99,24 @@ class ExposedNetwork:
         offset = np.float32(self.offset)
         # Pixels that exceed full scale lie beyond the network's reach of every pixel that takes
         # this factor.
-        brighter = np.clip(
+        multiplied = np.clip(
             (image - offset) * np.float32(factor) + offset, 0, np.float32(full_scale)
         )
-        restored = restore_window(brighter[None], self.infers[factor], full_scale)
-        return np.asarray((restored - offset) / np.float32(factor) + offset)
+        restored = restore_window(multiplied[None], self.infers[factor], full_scale)
+        divided = (restored - offset) / np.float32(factor) + offset
+        return np.asarray(np.clip(divided, 0, np.float32(full_scale)))
 
 
 def tiles_by_factor(
-    image: np.ndarray, plan: Plan, factors: Sequence[int], full_scale: float, offset: float = 0.0
-) -> dict[int, int]:
-    """Count the tiles of an image that need each exposure, the factor by which dark pixels are
+    image: np.ndarray, plan: Plan, factors: Sequence[float], full_scale: float, offset: float = 0.0
+) -> dict[float, int]:
+    """Count the tiles of an image that need each exposure, the factor by which pixels are
     multiplied before the network.
 
     Args:
         image: pixel values (H, W), none missing.
         plan: how the image is cut into tiles.
-        factors: the factors that the network offers, in ascending order, 1 first.
+        factors: the factors that the network offers, in ascending order.
         full_scale: the pixel value that is 1.0 to the network.
         offset: the pixel value that the sensor stores without light.
 

@@ -194,21 +194,21 @@ def network_restore(
         sensor: the sensor of the images. The sensor named "blind" is unknown, and the consistency
             step is then omitted.
         reference: the sensor that the restoration aims at.
-        around: the steps that are used: exposures, at which dark parts are multiplied by a factor
-            before the network, and the consistency step, which makes the result agree with the raw
-            image.
+        around: the steps that are used: exposures, at which parts of the image are multiplied by a
+            factor before the network, and the consistency step, which makes the result agree with
+            the raw image.
 
     Returns:
         A function from degraded to restored digital numbers, (H, W) each.
     """
     exposures = exposures_of(network, around)
-    brighter = {factor: other.model for factor, other in exposures.items()}
+    exposed = {factor: other.model for factor, other in exposures.items()}
     instrument = sensor.nominal()
     # The consistency step blurs the result as the sensor does: it needs one that is known.
     aim = None
     if around.consistency and sensor.name != NOT_KNOWN:
         aim = reference.in_units_of(instrument)
-    return network_method(network.model, instrument.max_dn, brighter, instrument, aim)
+    return network_method(network.model, instrument.max_dn, exposed, instrument, aim)
 
 
 def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:
