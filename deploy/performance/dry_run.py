@@ -165,7 +165,7 @@ def time_here(network: Network, plan: Plan, engine: Engine) -> Figure:
 def time_on_board(network: Network, plan: Plan, target: TargetProfile) -> Figure:
     """Predict the time of all tiles on a board's DPU by the cost model, in whole batches.
 
-    Each tile counts once, as if no pixel needed a higher exposure. The board's processor computes
+    Each tile counts once, as if no pixel needed another exposure. The board's processor computes
     the consistency step (block means agree with the raw image) if the network retains the image
     size and the bands.
 

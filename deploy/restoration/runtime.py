@@ -224,7 +224,7 @@ def session_threads(threads: int, at_once: int) -> int:
 
 class AtFirstCall:
     """A network that is opened when it is first run, and stays open. Versions of a network for
-    higher exposures are opened in this way, because a bright image needs none of them.
+    other exposures are opened in this way, because few images need all of them.
     """
 
     def __init__(self, open_network: Callable[[], tuple[Infer, str]]) -> None:

@@ -104,7 +104,7 @@ def restore(
         strict: refuse what contradicts the sensor or fails the self-check, instead of a warning.
         consistency: make the result agree with the image at low spatial frequencies, if the sensor
             is named.
-        exposure: restore dark parts at a higher exposure (shipped networks).
+        exposure: restore dark parts and strong edges at other exposures (shipped networks).
         fix_detectors: interpolate faulty pixels first: 'found' searches for them and lists them
             next to the output; or a list, lines of column,row with * for a whole column.
         force: accept an image that was restored before, follow an index out of its folder, and

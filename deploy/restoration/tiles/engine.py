@@ -66,7 +66,7 @@ class Restorer:
     Attributes:
         raster: the description of the image.
         networks: the network for all groups of bands, or one for each group, with its versions for
-            higher exposures, at which dark parts are restored.
+            the exposures at which dark parts and strong edges are restored.
         full_scale: the pixel value that is 1.0 to the networks.
         plan: how the image is cut into tiles. Missing pixels are filled from pixels within the
             network's receptive radius. Pixels beyond that do not influence a known pixel.

@@ -13,6 +13,7 @@ import onnx
 import pytest
 import tifffile
 from numpy.testing import assert_array_equal
+from scipy.ndimage import gaussian_filter
 
 from beers_deploy.model.consistency.step import REACH_PX
 from beers_deploy.profiles.errors import MachineError, OptionError
@@ -216,6 +217,21 @@ def test_each_step_changes_what_it_is_for() -> None:
     assert not changed[:, BRIGHT_FROM + RADIUS_PX :].any()
     assert (results["consistency"] != results["none"]).mean() > 0.8
     assert (results["both"] != results["exposure"]).mean() > 0.8
+
+
+def test_points_of_light_are_corrected_in_int8_as_far_as_in_float() -> None:
+    """Their corrections exceed what INT8 represents at the factor 1."""
+    light = np.full(SHAPE, 300.0)
+    light[60, 70] = 8000
+    light[90:92, 50:52] = 2700
+    pixels = gaussian_filter(light, 0.8).clip(0, 4095).astype(np.float32)
+    in_float = by_array(pixels, FLOAT)
+    inner = (slice(20, -20), slice(20, -20))
+    with_exposure, without = (
+        np.abs(by_array(pixels, INT8, exposure=exposure) - in_float)[inner].max()
+        for exposure in (True, False)
+    )
+    assert with_exposure < 0.3 * without
 
 
 @pytest.mark.parametrize(
