@@ -14,7 +14,7 @@ from beers_deploy.kit.golden import PICTURE, save_array, write_golden
 from beers_deploy.kit.host_facts import host_facts
 from beers_deploy.kit.record import require_library, write_record
 from beers_deploy.model.consistency.step import REACH_PX
-from beers_deploy.model.exposure import HEADROOM, SHARPEST
+from beers_deploy.model.exposure import HEADROOM, SHARPEST, SHARPEST_IN_DARK
 from beers_deploy.model.io.files import write_text
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.network_files import other_sensor
@@ -125,6 +125,7 @@ class Board(TargetProfile):
             "reach": REACH_PX,
             "headroom": HEADROOM,
             "sharpest": SHARPEST,
+            "sharpest_in_dark": SHARPEST_IN_DARK,
         }
         write_text(folder / "README.md", README.read_text(encoding="utf-8").format(**words))
         return folder

@@ -153,7 +153,7 @@ def factors(tile: np.ndarray) -> np.ndarray:
     sharpest = largest_around(sharp, S["halo_px"] - 1)
     brightest = largest_around(pixels, S["halo_px"]) - DARK
     for factor in others:
-        suits = sharpest * F(factor) <= F(S["sharpest"])
+        suits = sharpest * F(factor) <= F(S["sharpest"][factor > 1])
         if factor > 1:
             suits &= brightest * F(factor) + DARK <= F(S["headroom"])
         choice[suits] = factor

@@ -5,7 +5,7 @@ the consistency step.
 from collections.abc import Mapping
 
 from beers_deploy.model.consistency.step import Consistency
-from beers_deploy.model.exposure import HEADROOM, SHARPEST
+from beers_deploy.model.exposure import HEADROOM, SHARPEST, SHARPEST_IN_DARK
 from beers_deploy.model.self_check import (
     CELL_PX,
     LEAST_SHARPENING,
@@ -72,7 +72,7 @@ def host_facts(
         },
         # These three decide which factor a pixel gets, as shares of full scale.
         "headroom": HEADROOM,
-        "sharpest": SHARPEST,
+        "sharpest": [SHARPEST, SHARPEST_IN_DARK],
         "offset": instrument.offset_dn / instrument.max_dn if instrument else 0.0,
         "consistency": step,
         "self_check": None if sensor is None or step is None else self_check_facts(sensor),

@@ -19,6 +19,7 @@ from beers_deploy.model.exposure import (
     MOST_FACTORS,
     NOISE_BEYOND,
     SHARPEST,
+    SHARPEST_IN_DARK,
     TOLD_NOISE_BEYOND,
     UNCHANGED,
     brightened,
@@ -124,8 +125,8 @@ sides = st.integers(1, 60)
 def test_a_pixel_takes_the_highest_factor_that_leaves_headroom(
     seed: int, height: int, width: int, radius_px: int, offset: float
 ) -> None:
-    """By a loop over pixels; so HEADROOM and SHARPEST hold everywhere within the radius, unless a
-    pixel gets the smallest factor.
+    """By a loop over pixels. So HEADROOM and the limits of edges hold everywhere within the radius,
+    unless a pixel gets the smallest factor.
     """
     image = image_of(seed, height, width)
     factors = (0.5, 1, 4, 8)
@@ -142,7 +143,7 @@ def test_a_pixel_takes_the_highest_factor_that_leaves_headroom(
             factor
             for factor in factors[1:]
             if (factor == 1 or (brightest - offset) * factor + offset <= HEADROOM * FULL_SCALE)
-            and sharpest * factor <= SHARPEST * FULL_SCALE
+            and sharpest * factor <= (SHARPEST if factor == 1 else SHARPEST_IN_DARK) * FULL_SCALE
         ]
         assert selected[row, column] == max(fitting, default=0.5)
 
