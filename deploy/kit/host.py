@@ -143,14 +143,14 @@ def factors(tile: np.ndarray) -> np.ndarray:
     """Choose the exposure, a factor of brightness, of every pixel (h, w) of a tile (1, C, h, w).
 
     A pixel gets the largest factor at which no pixel within the network's receptive radius exceeds
-    `headroom`, or differs from its neighbours by more than `sharpest`; or else the smallest one.
+    `headroom` and none within `edge_px` differs by `sharpest` from its neighbours; or the smallest.
     """
     smallest, *others = sorted(UNITS)
     choice = np.full(tile.shape[2:], smallest)
     pixels = tile[0, 0]
     third = np.full(3, 1 / 3, F)
     sharp = np.abs(pixels - summed(np.pad(pixels, 1, "edge"), third, third, 1))
-    sharpest = largest_around(sharp, S["halo_px"] - 1)
+    sharpest = largest_around(sharp, S["edge_px"])
     brightest = largest_around(pixels, S["halo_px"]) - DARK
     for factor in others:
         suits = sharpest * F(factor) <= F(S["sharpest"][factor > 1])

@@ -5,7 +5,7 @@ the consistency step.
 from collections.abc import Mapping
 
 from beers_deploy.model.consistency.step import Consistency
-from beers_deploy.model.exposure import HEADROOM, SHARPEST, SHARPEST_IN_DARK
+from beers_deploy.model.exposure import HEADROOM, SHARPEST, SHARPEST_IN_DARK, edge_radius_px
 from beers_deploy.model.self_check import (
     CELL_PX,
     LEAST_SHARPENING,
@@ -70,9 +70,10 @@ def host_facts(
         "exposures": {
             f"{factor:g}": _unit(facts, other, tile_px) for factor, other in others.items()
         },
-        # These three decide which factor a pixel gets, as shares of full scale.
+        # These decide which factor a pixel gets; all but `edge_px` are shares of full scale.
         "headroom": HEADROOM,
         "sharpest": [SHARPEST, SHARPEST_IN_DARK],
+        "edge_px": edge_radius_px(network.tiling.halo_px),
         "offset": instrument.offset_dn / instrument.max_dn if instrument else 0.0,
         "consistency": step,
         "self_check": None if sensor is None or step is None else self_check_facts(sensor),

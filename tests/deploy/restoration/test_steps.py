@@ -16,6 +16,7 @@ from numpy.testing import assert_array_equal
 from scipy.ndimage import gaussian_filter
 
 from beers_deploy.model.consistency.step import REACH_PX
+from beers_deploy.model.exposure import EDGE_RADIUS_PX
 from beers_deploy.profiles.errors import MachineError, OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND
@@ -213,8 +214,8 @@ def test_each_step_changes_what_it_is_for() -> None:
     end = BRIGHT_FROM - RADIUS_PX
     changed = results["exposure"] != results["none"]
     assert changed[:, :end].mean() > 0.9
-    assert changed[:, end : BRIGHT_FROM + RADIUS_PX].mean() > 0.3
-    assert not changed[:, BRIGHT_FROM + RADIUS_PX :].any()
+    assert changed[:, end : BRIGHT_FROM + EDGE_RADIUS_PX].mean() > 0.3
+    assert not changed[:, BRIGHT_FROM + EDGE_RADIUS_PX + 1 :].any()
     assert (results["consistency"] != results["none"]).mean() > 0.8
     assert (results["both"] != results["exposure"]).mean() > 0.8
 
