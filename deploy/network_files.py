@@ -76,7 +76,7 @@ class Conditioned:
                 has a known INT8 file.
         """
         if not int8:
-            return float_for(self.weights, self.name, brightened(sensor, exposure.told))
+            return float_for(self.weights, self.name, brightened(sensor, exposure.gain))
         shipped = SHIPPED / f"{self.name}{INT8}.onnx"
         if self.weights.parent != SHIPPED:
             raise ModelError(
@@ -244,7 +244,7 @@ def int8_for_sensor(
         ModelError: `model` cannot be conditioned on a sensor.
     """
     stored = required_conditioned_core(model)
-    instrument = brightened(sensor, exposure.told).nominal()
+    instrument = brightened(sensor, exposure.gain).nominal()
     core = stored.for_sensor(
         network_bank(instrument, stored.kernels),
         sensor_vector(instrument).values,

@@ -11,11 +11,11 @@ HEADROOM of full scale, and none within EDGE_RADIUS_PX differs too much from its
 choice depends only on the pixels that the network reads anyway, so tiles with an exact halo choose
 as the whole image does.
 
-An integer network can be multiplied further than its training range allows. It is told a smaller
-gain than the factor, and the rest of the factor makes its steps finer (`Exposure.finer`): a body
-of convolutions, ReLU and sums passes a positive factor on, so only its biases must grow with it.
-Around points of light and edges of saturated areas, the correction exceeds what INT8 represents.
-There a factor of 1/2 makes the steps coarser and their range wider.
+Before an integer network, the image can be multiplied further than the training range allows. The
+network is then conditioned on a sensor of less gain, and the rest of the factor makes its steps
+finer (`Exposure.finer`): a body of convolutions, ReLU and sums passes a positive factor on, so only
+its biases must grow with it. Around points of light and edges of saturated areas, the correction
+exceeds what INT8 represents. There a factor of 1/2 makes the steps coarser and their range wider.
 """
 
 from collections.abc import Iterable
@@ -98,31 +98,32 @@ well, and at 8 they are clipped: behind the noisiest sensor the result then lost
 training places).
 """
 
-TOLD_NOISE_BEYOND = 1.1
-"""How far the noise that an integer network is told may exceed that of the training range.
+GAIN_NOISE = 1.1
+"""How far the noise of the sensor that an integer network is conditioned on may exceed that of the
+training range.
 
 It may be less than NOISE_BEYOND, because finer steps replace the rest of the factor: at 1.15 times
-a network lost 0.1 dB to one that was told half the gain (measured on training places).
+a network lost 0.1 dB to one of half the gain (measured on training places).
 """
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """A factor by which dark pixels are multiplied, and the gain of the sensor that the network is
-    told.
+    """A factor by which pixels are multiplied, and the sensor that the network is conditioned on.
 
     Attributes:
         factor: the factor, a power of two; 1 for pixels that stay as they are.
-        told: the part of the factor by which the gain of the told sensor grows, a power of two.
+        gain: the part of the factor, a power of two, by which the gain of that sensor exceeds the
+            gain of the sensor that acquired the image.
     """
 
     factor: float = 1
-    told: int = 1
+    gain: int = 1
 
     @property
     def finer(self) -> float:
         """The rest of the factor, by which the steps of an integer network become finer."""
-        return self.factor / self.told
+        return self.factor / self.gain
 
 
 UNCHANGED = Exposure()
@@ -152,17 +153,17 @@ def exposures_for(sensor: Instrument, *, int8: bool) -> tuple[Exposure, ...]:
     Args:
         sensor: the sensor of the images.
         int8: True for an integer network, whose steps may be made finer or coarser; False for a
-            float one, which is told the whole factor.
+            float one, whose sensor has the whole factor as gain.
     """
     if not int8:
         return tuple(Exposure(factor, factor) for factor in factors_for(sensor))
     excess = {factor: noise_excess(sensor, factor) for factor in INTEGER_FACTORS}
-    told = max((f for f in FACTORS if excess[f] <= TOLD_NOISE_BEYOND), default=1)
-    possible = [f for f in INTEGER_FACTORS if f <= FINEST * told]
-    usable = [f for f in possible if f <= told or excess[f] <= INTEGER_NOISE]
+    gain = max((f for f in FACTORS if excess[f] <= GAIN_NOISE), default=1)
+    possible = [f for f in INTEGER_FACTORS if f <= FINEST * gain]
+    usable = [f for f in possible if f <= gain or excess[f] <= INTEGER_NOISE]
     highest = usable[-1] if usable else 1
     factors = [f for f in (highest // INTEGER_STEP, highest) if f > 1]
-    return (DIMMED, UNCHANGED, *(Exposure(factor, min(factor, told)) for factor in factors))
+    return (DIMMED, UNCHANGED, *(Exposure(factor, min(factor, gain)) for factor in factors))
 
 
 def noise_excess(sensor: Instrument, factor: float) -> float:

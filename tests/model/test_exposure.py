@@ -13,6 +13,7 @@ from beers_deploy.model.exposure import (
     EDGE_RADIUS_PX,
     FACTORS,
     FINEST,
+    GAIN_NOISE,
     HEADROOM,
     INTEGER_FACTORS,
     INTEGER_NOISE,
@@ -21,7 +22,6 @@ from beers_deploy.model.exposure import (
     NOISE_BEYOND,
     SHARPEST,
     SHARPEST_IN_DARK,
-    TOLD_NOISE_BEYOND,
     UNCHANGED,
     brightened,
     choose_factors,
@@ -63,23 +63,25 @@ def test_the_factors_of_shipped_sensors(name: str, factors: tuple[int, ...]) -> 
 
 
 @given(st.floats(0.05, 20))
-def test_an_integer_network_is_told_what_training_knew_and_finer_by_the_rest(times: float) -> None:
-    """A network is told as much of a factor as its training range allows. The highest factor is the
+def test_an_integer_network_has_the_gain_that_training_knew_and_is_finer_by_the_rest(
+    times: float,
+) -> None:
+    """The gain has as much of a factor as the training range allows. The highest factor is the
     largest at which the noise is not too much, and the lower one is INTEGER_STEP times smaller.
     """
     sensor = noisier(times)
     dimmed, unchanged, *exposures = exposures_for(sensor, int8=True)
-    assert (dimmed.factor, dimmed.told) == (0.5, 1)
+    assert (dimmed.factor, dimmed.gain) == (0.5, 1)
     assert unchanged == UNCHANGED
     factors = [exposure.factor for exposure in exposures]
     assert set(factors) <= set(INTEGER_FACTORS)
     for exposure in exposures:
-        assert exposure.told * exposure.finer == exposure.factor
-        assert exposure.told == 1 or noise_excess(sensor, exposure.told) <= TOLD_NOISE_BEYOND
+        assert exposure.gain * exposure.finer == exposure.factor
+        assert exposure.gain == 1 or noise_excess(sensor, exposure.gain) <= GAIN_NOISE
         if exposure.finer > 1:
             assert exposure.finer <= FINEST
             assert noise_excess(sensor, exposure.factor) <= INTEGER_NOISE
-            assert exposure.told == 8 or noise_excess(sensor, 2 * exposure.told) > TOLD_NOISE_BEYOND
+            assert exposure.gain == 8 or noise_excess(sensor, 2 * exposure.gain) > GAIN_NOISE
     highest = max(factors, default=1)
     if highest < max(INTEGER_FACTORS) and all(exposure.finer < FINEST for exposure in exposures):
         assert noise_excess(sensor, 2 * highest) > INTEGER_NOISE
@@ -88,7 +90,7 @@ def test_an_integer_network_is_told_what_training_knew_and_finer_by_the_rest(tim
 
 
 @given(st.floats(0.05, 20))
-def test_a_float_network_is_told_the_whole_factor(times: float) -> None:
+def test_a_float_network_has_the_whole_factor_as_gain(times: float) -> None:
     exposures = exposures_for(noisier(times), int8=False)
     assert all(exposure.finer == 1 for exposure in exposures)
     assert tuple(exposure.factor for exposure in exposures) == factors_for(noisier(times))
