@@ -203,10 +203,9 @@ class Network:
 
     @cached_property
     def exposures(self) -> Mapping[float, "Network"]:
-        """The networks for dark pixels and strong edges, each under its exposure factor.
+        """The networks for dark pixels and strong edges by exposure factor; none without a sensor.
 
         `restore` multiplies such pixels, runs the network of the factor, and divides the result.
-        There are none for a network of no sensor, nor in float32 if the noise allows no factor.
         """
         if self.weights is None or self.profile is None:
             return {}

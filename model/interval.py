@@ -6,7 +6,7 @@ pixels.
 s is the standard deviation of the restored image in a window of 3 x 3 pixels, and sigma the noise
 of the sensor's profile at the window's mean. The error of a restoration grows with both: noise
 that the network takes for detail, and detail that it takes for noise or that the blur hides. m and
-n are logarithms of the sensor's MTF at Nyquist and of its noise over full scale, around the middle
+n are logarithms of the sensor's MTF up to Nyquist and of its noise over full scale, from the middle
 of the trained range: what a sensor blurs more, it hides more of, and what a network adds of its own
 weighs more where noise is low. Windows of 5 x 5 and 7 x 7 pixels ranked errors less well (0.863 and
 0.843 instead of 0.886, measured).
@@ -82,8 +82,8 @@ class Exponents:
     Attributes:
         detail: d, the exponent of the local detail s / sigma (the deviation of nearby restored
             pixels over that of the noise).
-        blur: b, the factor of the logarithm of the MTF at Nyquist.
-        detail_by_blur: k, the change of d with the logarithm of the MTF at Nyquist.
+        blur: b, the factor of the logarithm m of the MTF.
+        detail_by_blur: k, the change of d with the logarithm m of the MTF.
         noise: c, the factor of the logarithm of the noise over full scale.
     """
 
