@@ -1,7 +1,7 @@
 """Quantise a network in one call: float ONNX and calibration patches in, the integer core and its
 file for the host out.
 
-1. Read the network, and let it read bit planes.
+1. Read the network, let it read bit planes, and take the image out of long skip connections.
 2. Find the residual groups and the single tensors, whose channels may be scaled.
 3. Choose the scale of each tensor by least squares.
 4. Exclude groups in which int8 could not end at a ReLU6's six.
@@ -66,6 +66,7 @@ from beers_deploy.quant.passes.equalize_single import (
     single_ranges,
 )
 from beers_deploy.quant.passes.least_squares import choose_frac_bits
+from beers_deploy.quant.passes.long_skip import split_long_skips
 from beers_deploy.quant.passes.residual_groups import (
     GROUP_FRAC_BITS,
     ResidualGroup,
@@ -74,7 +75,12 @@ from beers_deploy.quant.passes.residual_groups import (
     single_tensors,
 )
 from beers_deploy.quant.passes.selection import ALL, Passes
-from beers_deploy.quant.passes.trial import CropTrials, Trials, crop_count, search_targets
+from beers_deploy.quant.passes.trial import (
+    CropTrials,
+    Trials,
+    crop_count,
+    search_targets,
+)
 from beers_deploy.quant.samples.coverage import KEY, histogram, range_from
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import crops, halo_of
@@ -84,7 +90,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-PASSES = "fine_planes, least_squares, shared_residual_scale, equalise, dual_gain"
+PASSES = "fine_planes, long_skip, least_squares, shared_residual_scale, equalise, dual_gain"
 """The record in a file of the applied passes, in the words of the first files."""
 
 FINETUNE = "finetune"
@@ -213,6 +219,9 @@ def quantize_model(
     network = read_network(model)
     host_part = HostPart.of(network, Plain(), patches.ranges)
     graph = read_planes(network.graph, host_part.full_scale)
+    # Without a global add the result contains the image, which int8 has to represent anyway.
+    if passes.long_skip and network.adds_image:
+        graph = split_long_skips(graph)
     if passes.dual_range and network.adds_image and can_write_copies(graph):
         host_part = replace(host_part, decoding=DualRange())
     # 2.

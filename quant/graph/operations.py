@@ -148,6 +148,8 @@ class Conv(OneInput):
         groups: 1, or the number of channels of a depthwise convolution.
         transposed: True for a transposed convolution.
         ceiling: (O,) the upper limits of a ReLU6 whose channels were scaled; None for 6.
+        scalable: False if its results already use int8 as they should, so that equalisation must
+            not scale them.
     """
 
     weight: np.ndarray
@@ -158,6 +160,7 @@ class Conv(OneInput):
     transposed: bool = False
     # (O,) where ReLU6 clips each channel once they are scaled; None at 6.
     ceiling: np.ndarray | None = None
+    scalable: bool = True
 
     @property
     def ceilings(self) -> np.ndarray:

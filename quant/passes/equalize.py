@@ -64,12 +64,17 @@ def equalize(graph: Graph, group: ResidualGroup, factors: np.ndarray) -> Graph:
     Args:
         graph: the float graph.
         group: the tensors whose channels are scaled.
-        factors: (C,) the factor of each channel of the group, above 0.
+        factors: (C,) the factor of each channel of the group, above 0. Channels of convolutions
+            that are not scalable keep their scale.
     """
     factors = np.array(factors, np.float64)
     for op in graph:
-        if isinstance(op, Conv) and op.output in group and op.activation is Activation.relu6:
-            part = group[op.output]
+        if not isinstance(op, Conv) or op.output not in group:
+            continue
+        part = group[op.output]
+        if not op.scalable:
+            factors[part] = 1.0
+        if op.activation is Activation.relu6:
             # 2. Below this factor int8 would end beyond the six, and ReLU could not stand for
             # ReLU6.
             factors[part] = np.maximum(factors[part], FULL / op.ceilings)

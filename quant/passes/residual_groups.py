@@ -24,6 +24,7 @@ from beers_deploy.quant.graph import (
     Graph,
     MaxPool,
     Op,
+    Pointwise,
     Resize,
     channels_of,
 )
@@ -64,7 +65,7 @@ def residual_groups(graph: Graph) -> list[ResidualGroup]:
         group's channels.
     """
     # 1.
-    linking = [op for op in graph if isinstance(op, (Add, *PASSING))]
+    linking = [op for op in graph if isinstance(op, Add) or _passes_channels(op)]
     leader = united((*op.inputs, op.output) for op in linking)
     sums = {leader[op.output] for op in linking if isinstance(op, Add)}
     groups = [
@@ -144,8 +145,17 @@ def single_tensors(graph: Graph) -> list[str]:
     adds = [op for op in graph if isinstance(op, Add)]
     terms = set(chain.from_iterable((*op.inputs, op.output) for op in adds))
     outputs = [op.output for op in graph if isinstance(op, Conv) and op.output not in terms]
-    passing = set(chain.from_iterable(op.inputs for op in graph if isinstance(op, PASSING)))
+    passing = set(chain.from_iterable(op.inputs for op in graph if _passes_channels(op)))
     return [name for name in outputs if name not in passing and _passes_factors(graph, only(name))]
+
+
+def _passes_channels(op: Op) -> bool:
+    """Return True if an operation computes each channel of its output from one channel of an input,
+    in proportion to it.
+    """
+    if isinstance(op, Pointwise):
+        return op.activation.homogeneous
+    return isinstance(op, PASSING)
 
 
 def _passes_factors(graph: Graph, group: ResidualGroup) -> bool:
@@ -157,7 +167,7 @@ def _passes_factors(graph: Graph, group: ResidualGroup) -> bool:
     # The host writes the planes and reads the correction, and knows no factors.
     if group.keys() & {PLANES, CORRECTION}:
         return False
-    if not all(isinstance(op, (Conv, Add, *PASSING)) for op in touching):
+    if not all(isinstance(op, Conv | Add) or _passes_channels(op) for op in touching):
         return False
     return all(
         op.activation.homogeneous or (isinstance(op, Conv) and op.activation is Activation.relu6)

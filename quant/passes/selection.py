@@ -11,6 +11,7 @@ class Passes:
     gain.
 
     Attributes:
+        long_skip: True takes the image out of long skip connections.
         dual_range: True writes the result in several copies of different scales, which represent it
             more finely than one.
         least_squares: True chooses the scale of least squared error for each tensor, False the
@@ -19,6 +20,7 @@ class Passes:
             channels of a residual group, at which the widest fits int8.
     """
 
+    long_skip: bool = True
     dual_range: bool = True
     least_squares: bool = True
     equalization: bool = True

@@ -19,6 +19,7 @@ from beers_deploy.quant.graph import (
     Conv,
     Graph,
     MaxPool,
+    Pointwise,
     Resize,
     Window,
     graph_to_onnx,
@@ -122,6 +123,24 @@ def test_a_group_goes_through_pools_enlargements_and_concats() -> None:
         for each in (graph, scaled)
     )
     np.testing.assert_allclose(actual, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("activation", "passes"), [(Activation.leaky_relu, True), (Activation.hard_swish, False)]
+)
+def test_a_group_goes_through_activations_in_proportion_to_their_input(
+    activation: Activation, passes: bool
+) -> None:
+    head, inner, add, *_ = skipping()
+    last = Conv(
+        "last", "active", CORRECTION, np.ones((1, 3, 1, 1), np.float32), np.zeros(1, np.float32)
+    )
+    graph = (head, inner, add, Pointwise("act", "sum", "active", activation), last)
+    groups = residual_groups(graph)
+    assert [set(group) for group in groups] == passes * [{"head", "inner", "sum", "active"}]
+    for group in groups:
+        scaled = equalize(graph, group, np.random.default_rng(2).lognormal(-1, 1, 3))
+        np.testing.assert_allclose(correction(scaled), correction(graph), atol=2e-6)
 
 
 def test_a_tensor_that_would_have_two_places_is_in_no_group() -> None:
@@ -250,7 +269,7 @@ def test_all_passes_lose_far_less_than_none(
     def mae(int8: Quantized) -> float:
         return compare(open_session(float_onnx), open_session(int8.host), patches).mae
 
-    few = Passes(dual_range=False, least_squares=False, equalization=False)
+    few = Passes(long_skip=False, dual_range=False, least_squares=False, equalization=False)
     rounded = quantize_model(float_onnx, patches, {}, passes=few)
     last = rounded.core.ops[-1]
     assert isinstance(last, IntConv)
@@ -263,4 +282,9 @@ def test_each_step_is_named(float_onnx: onnx.ModelProto, patches: Patches) -> No
     with reporting(reported.append), progress("calibrating"):
         quickly(float_onnx, patches)
     names = [step.what.removeprefix("calibrating: ") for step in reported]
-    assert [name.split(" ")[0] for name in names] == ["scale", "float", "equalising"]
+    assert [name.split(" ")[0] for name in names] == [
+        "scale",
+        "float",
+        "equalising",
+        "equalising",
+    ]

@@ -118,9 +118,10 @@ def test_running_only_what_changes_costs_the_same_as_running_all(
         cost = costs(self, parts, values, core)
         whole = open_session(host_model(core, {}), threads=1)
         errors = []
-        for (crop, target), change in zip(self.targets, self.changes, strict=True):
-            difference = whole.run(None, {"image": crop})[0] - target
-            errors.append(np.linalg.norm(difference) / np.sqrt(difference.size) / change)
+        for target, change in zip(self.targets, self.changes, strict=True):
+            difference = whole.run(None, {"image": target.image})[0] - target.result
+            error = np.linalg.norm(difference) / np.sqrt(difference.size) / change
+            errors.append(target.weight * error)
         seen.append((cost(None), np.array(errors)))
         return cost
 

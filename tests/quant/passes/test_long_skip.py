@@ -1,0 +1,151 @@
+"""Taking the image out of a long skip connection leaves the float network as it was, and makes its
+sums small.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor, nn
+
+from beers_deploy.quant.graph import (
+    CORRECTION,
+    IMAGE,
+    PLANES,
+    Activation,
+    Add,
+    Conv,
+    Graph,
+    graph_to_onnx,
+    read_planes,
+    same,
+)
+from beers_deploy.quant.passes.long_skip import split_long_skips
+from beers_deploy.quant.passes.selection import ALL
+from beers_deploy.quant.quantize import quantize_model
+from beers_deploy.quant.session import open_session, result_of
+from beers_deploy.quant.simplify.simplify import simplify
+from examples.networks import to_onnx
+from tests.quant.quick import patches_of, waves
+
+FEATURES = 5
+
+
+def conv(generator: np.random.Generator, source: str, output: str, shape: tuple[int, ...]) -> Conv:
+    weight = generator.normal(0, 0.5, shape).astype(np.float32)
+    bias = generator.normal(0, 0.5, shape[0]).astype(np.float32)
+    return Conv(f"{output}.conv", source, output, weight, bias, Activation.none, same(weight))
+
+
+def skipping(seed: int, channels: int = 1, head: int = 3, tail: int = 3) -> Graph:
+    """A body whose features are added to those of the head, which it reads too."""
+    generator = np.random.default_rng(seed)
+    first = conv(generator, IMAGE, "head", (FEATURES, channels, head, head))
+    inner = conv(generator, "head", "inner", (FEATURES, FEATURES, 3, 3))
+    last = conv(generator, "sum", CORRECTION, (2, FEATURES, tail, tail))
+    body = replace(inner, activation=Activation.relu)
+    return read_planes((first, body, Add("add", ("inner", "head"), "sum"), last))
+
+
+def run(graph: Graph, names: list[str], channels: int = 1) -> list[np.ndarray]:
+    generator = np.random.default_rng(3)
+    planes = generator.integers(-128, 128, (1, 3 * channels, 7, 12)) / np.float32(128)
+    session = open_session(graph_to_onnx(graph, names, 3 * channels))
+    return list(session.run(None, {PLANES: planes.astype(np.float32)}))
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    channels=st.integers(1, 4),
+    head=st.sampled_from([1, 3, 5]),
+    tail=st.sampled_from([1, 3]),
+)
+def test_the_float_network_stays_also_at_the_border(
+    seed: int, channels: int, head: int, tail: int
+) -> None:
+    graph = skipping(seed, channels, head, tail)
+    split = split_long_skips(graph)
+    assert len(split) == len(graph) + 3
+    (before,) = run(graph, [CORRECTION], channels)
+    (after,) = run(split, [CORRECTION], channels)
+    np.testing.assert_allclose(after, before, atol=2e-5 * np.abs(before).max())
+
+
+def test_the_sum_no_longer_follows_the_brightness_of_the_ground() -> None:
+    split = split_long_skips(skipping(0))
+    session = open_session(graph_to_onnx(split, ["sum.head"], 3))
+    inner = []
+    for level in (0.1, 0.9):
+        planes = np.full((1, 3, 9, 9), level, np.float32)
+        inner.append(session.run(None, {PLANES: planes})[0][..., 2:-2, 2:-2])
+    np.testing.assert_allclose(inner[0], inner[1], atol=1e-4)
+
+
+def test_a_head_that_nothing_else_reads_is_replaced() -> None:
+    first, body, *others = skipping(0)
+    graph = (first, replace(body, input=PLANES, weight=body.weight[:, :3]), *others)  # type: ignore[type-var, attr-defined]
+    split = split_long_skips(graph)
+    assert "head" not in {op.output for op in split}
+    np.testing.assert_allclose(*(run(each, [CORRECTION])[0] for each in (graph, split)), atol=2e-4)
+
+
+def spoilt() -> dict[str, Graph]:
+    first, body, add, last = skipping(0)
+    assert isinstance(add, Add)
+    assert isinstance(first, Conv)
+    again = conv(np.random.default_rng(1), "sum", "other", (2, FEATURES, 1, 1))
+    apart = Add("end", ("other", CORRECTION + ".1"), CORRECTION)
+    return {
+        "activation of the sum": (first, body, replace(add, activation=Activation.relu), last),
+        "activation of the head": (replace(first, activation=Activation.relu), body, add, last),
+        "twice the head": (first, body, replace(add, inputs=("head", "head")), last),
+        "two readers": (first, body, add, again, replace(last, output=CORRECTION + ".1"), apart),  # type: ignore[type-var]
+        "depthwise": (first, body, add, replace(last, groups=FEATURES)),  # type: ignore[type-var]
+        "even": (replace(first, weight=first.weight[..., :2, :2]), body, add, last),
+    }
+
+
+@pytest.mark.parametrize("name", spoilt())
+def test_other_sums_are_left_alone(name: str) -> None:
+    graph = spoilt()[name]
+    assert split_long_skips(graph) is graph
+
+
+class Bright(nn.Module):
+    """A network whose head carries the image far above the details that its result consists of."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.head = nn.Conv2d(1, 8, 3, padding=1)
+        self.body = nn.Sequential(nn.Conv2d(8, 8, 3, padding=1), nn.ReLU())
+        self.tail = nn.Conv2d(8, 1, 3, padding=1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        head = self.head(image)
+        correction: Tensor = self.tail(self.body(head) + head)
+        return image + 0.02 * correction
+
+
+def test_int8_errs_less() -> None:
+    network = Bright()
+    generator = torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        for numbers in network.parameters():
+            numbers.uniform_(-0.3, 0.3, generator=generator)
+        # Each feature is the image with some detail, and the tail cancels the image.
+        network.head.weight.mul_(0.3)[:, :, 1, 1] += 1
+        network.tail.weight.sub_(network.tail.weight.mean(1, keepdim=True))
+    model = simplify(to_onnx("dncnn", network), "bright")
+    *images, held_out = (0.1 + 0.8 * each for each in waves(5))
+    in_float = result_of(open_session(model), held_out)
+    errors = [
+        np.abs(result_of(open_session(int8.host), held_out) - in_float).mean()
+        for int8 in (
+            quantize_model(model, patches_of(images), {}, passes=replace(ALL, long_skip=split))
+            for split in (True, False)
+        )
+    ]
+    assert errors[0] < 0.7 * errors[1]
