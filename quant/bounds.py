@@ -72,6 +72,19 @@ def layer_bounds(core: IntCore) -> list[LayerBound]:
     return bounds
 
 
+def within_int8(core: IntCore) -> set[str]:
+    """Return the names of the tensors that no image makes exceed int8, so that none is clipped.
+
+    Args:
+        core: the integer core.
+    """
+    return {
+        op.output
+        for op, bound in zip(core.ops, layer_bounds(core), strict=True)
+        if bound.low >= INT8_MIN and bound.high <= INT8_MAX
+    }
+
+
 def _planes(core: IntCore) -> Range:
     low, high = core.host_part.encoding.limits
     channels = core.host_part.channels

@@ -18,6 +18,7 @@ import onnx
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.figures import Check
+from beers_deploy.quant.bounds import within_int8
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings import encoding_faults, read_core
 from beers_deploy.quant.float_parts import float_layers_check
@@ -93,7 +94,7 @@ def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> di
     """Return for each 8-bit tensor the share of values that may have been clipped, over all images.
 
     These are the values at the largest or smallest integer, as `Rounded.may_be_clipped` counts
-    them.
+    them. Tensors are left out that provably never exceed 8 bits, such as a copy of the image.
 
     Args:
         model: an INT8 network in any encoding.
@@ -106,7 +107,9 @@ def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> di
         ModelError: the nodes of the graph contradict their definition in ONNX, or the network does
             not run on an image.
     """
-    tensors = rounded_tensors(model)
+    core = _own_core(model)
+    within = within_int8(core) if core else set()
+    tensors = [tensor for tensor in rounded_tensors(model) if tensor.name not in within]
     if not tensors:
         return {}
     kinds = {
