@@ -131,6 +131,7 @@ class Plan:
         shifts: the smallest and largest shifts that the target allows.
         passes: the passes that reduce the error.
         effort: the effort of the search for equalisation factors.
+        brightens: True if the search also uses crops that are brightened to full scale.
     """
 
     graph: Graph
@@ -140,6 +141,7 @@ class Plan:
     shifts: Shifts
     passes: Passes = ALL
     effort: Effort = Effort.normal
+    brightens: bool = False
 
     def stages(self) -> list[Stage]:
         """Return the separate searches for equalisation factors, in order: the residual groups,
@@ -226,9 +228,11 @@ def quantize_model(
         host_part = replace(host_part, decoding=DualRange())
     # 2.
     groups = residual_groups(graph)
-    plan = Plan(
-        graph, host_part, groups, _singles(graph, host_part, groups), shifts, passes, effort
-    )
+    singles = _singles(graph, host_part, groups)
+    # Without a global add the image is in the tensors. Then scales that also fit bright ground left
+    # fine-tuning less to gain: a depthwise network lost 0.56 instead of -0.05 dB (measured).
+    brightens = network.adds_image or tuning is None
+    plan = Plan(graph, host_part, groups, singles, shifts, passes, effort, brightens)
     # 3. to 7.
     core, final = rounded(plan, patches.degraded)
     shares = (to_shares(image, patches.ranges) for image in patches.degraded)
@@ -315,7 +319,7 @@ def _equalized(
     work = work_of(graph, plan.host_part, first_crop)
     limit = bound(plan.stages(), graph, work, count, plan.effort)
     step("float results to compare with")
-    targets = search_targets(plan.graph, plan.host_part, images, limit.crops)
+    targets = search_targets(plan.graph, plan.host_part, images, limit.crops, plan.brightens)
     earlier: RoundedConvs = {}
     trials = CropTrials(lambda candidate: plan.core(candidate, frac_bits, earlier), targets)
     graph = plan.singles.scaled(graph, plan.singles.unscaled(frac_bits))

@@ -2,8 +2,8 @@
 
 1. Restore all crops of the calibration images in float, and order them by their largest correction.
 2. Keep the crops with the largest corrections, where int8 clips, and others of all sizes.
-3. Add some of them as bright as the sensor reads, because int8 must hold such ground even if no
-   calibration image shows it.
+3. Add some of them as bright as the sensor reads, if requested, because int8 must hold such ground
+   even if no calibration image shows it.
 4. Run each candidate on these crops, and return its error on each.
 """
 
@@ -18,7 +18,6 @@ from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings.host import live_tensors, part_model
 from beers_deploy.quant.graph import CORRECTION, PLANES, Graph, graph_to_onnx
 from beers_deploy.quant.host_part import ZERO, HostPart
-from beers_deploy.quant.host_part.input_encoding import BitSlices
 from beers_deploy.quant.input_range import Ranges
 from beers_deploy.quant.passes.effort import span
 from beers_deploy.quant.session import (
@@ -89,7 +88,11 @@ def crop_count(crop: np.ndarray, available: int) -> int:
 
 
 def search_targets(
-    graph: Graph, host_part: HostPart, images: Sequence[np.ndarray], count: int
+    graph: Graph,
+    host_part: HostPart,
+    images: Sequence[np.ndarray],
+    count: int,
+    brightens: bool = False,
 ) -> list[Target]:
     """Choose crops of the images for a search, and restore them in float.
 
@@ -102,6 +105,7 @@ def search_targets(
         host_part: the host's pre- and post-processing around the graph.
         images: calibration images (1, C, H, W).
         count: the number of crops; fewer are returned if there are not enough.
+        brightens: True to add some of the crops once more, brightened to full scale.
 
     Returns:
         The crops with their float results.
@@ -129,7 +133,7 @@ def search_targets(
     selection = [crops(images[k], halo_px)[n].copy() for k, n in places]
     targets = [Target(crop, restored(crop), 1.0) for crop in selection]
     # 3.
-    if isinstance(host_part.encoding, BitSlices):
+    if brightens:
         # Those with the largest corrections already have the brightest edges.
         for crop in selection[count // 4 :: BRIGHT]:
             bright = brightened(crop, host_part.input_ranges)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.quant.graph import CORRECTION, PLANES, Conv, same
-from beers_deploy.quant.host_part import Direct, HostPart
+from beers_deploy.quant.host_part import HostPart
 from beers_deploy.quant.passes.trial import BRIGHT, brightened, search_targets
 from tests.quant.quick import waves
 
@@ -28,16 +28,16 @@ def test_bright_ground_has_the_details_of_its_crop(
     np.testing.assert_array_equal(bright[:, 2], crop[:, 2].astype(np.float32))
 
 
-@pytest.mark.parametrize("encodes", [True, False])
-def test_one_crop_in_several_is_added_in_full_light(encodes: bool) -> None:
-    host_part = HostPart() if encodes else HostPart(encoding=Direct())
+@pytest.mark.parametrize("brightens", [True, False])
+def test_one_crop_in_several_is_added_in_full_light(brightens: bool) -> None:
+    host_part = HostPart()
     shape = (1, host_part.planes, 3, 3)
     weight = np.random.default_rng(0).normal(0, 0.1, shape).astype(np.float32)
     last = Conv("last", PLANES, CORRECTION, weight, np.zeros(1, np.float32), window=same(weight))
     images = [np.rint(64 * image) / 128 for image in waves(16)]
-    crops = [crop for crop, _, _ in search_targets((last,), host_part, images, 16)]
+    crops = [crop for crop, _, _ in search_targets((last,), host_part, images, 16, brightens)]
     originals = len(images)
-    assert len(crops) == originals + encodes * (12 // BRIGHT)
+    assert len(crops) == originals + brightens * (12 // BRIGHT)
     assert max(crop.max() for crop in crops[:originals]) < 0.5
     for crop in crops[originals:]:
         assert crop.max() == pytest.approx(1)
