@@ -4,7 +4,7 @@ from it.
 A first convolution (head) whose features are added to those of the last block carries the whole
 image: its range is wide and its steps are coarse, although the result hardly depends on its level.
 
-1. Find a sum of the head's features and others that one convolution (tail) alone reads.
+1. Find a sum of the head's features and others that the last convolution (tail) alone reads.
 2. Divide each feature of the head into its detail and the pixel itself times a gain, the sum of the
    feature's weights.
 3. Add only the detail. Put the pixel's coarse part and remainder beside the sum, as channels of
@@ -29,6 +29,7 @@ from beers_deploy.quant.graph import (
     Conv,
     Graph,
     Op,
+    Pointwise,
     same,
 )
 from beers_deploy.quant.passes.residual_groups import GROUP_FRAC_BITS
@@ -42,7 +43,7 @@ are exact: no value is clipped, and none is a tie that boards and processors rou
 
 
 def split_long_skips(graph: Graph) -> Graph:
-    """Return the graph in which no sum that one convolution alone reads contains the image.
+    """Return the graph in which no sum that the last convolution alone reads contains the image.
 
     Args:
         graph: a float graph that reads the int8 planes that an image is split into.
@@ -60,6 +61,12 @@ def split_long_skips(graph: Graph) -> Graph:
                 with np.errstate(over="ignore", invalid="ignore"):
                     result = _split(result, head, add, tail)
     return result
+
+
+def activates_sums(graph: Graph) -> bool:
+    """Return True if an activation of its own stands behind a sum, as in distillation networks."""
+    sums = {op.output for op in graph if isinstance(op, Add)}
+    return any(isinstance(op, Pointwise) and op.input in sums for op in graph)
 
 
 def _head(graph: Graph, add: Add) -> Conv | None:
@@ -81,12 +88,14 @@ def _head(graph: Graph, add: Add) -> Conv | None:
 
 
 def _tail(graph: Graph, add: Add) -> Conv | None:
-    """Return the convolution that reads a sum; None if others read it too."""
+    """Return the last convolution if it alone reads a sum; else None."""
     readers = [op for op in graph if add.output in op.inputs]
-    if add.output == CORRECTION or len(readers) != 1:
+    if len(readers) != 1:
         return None
     (tail,) = readers
-    return tail if isinstance(tail, Conv) and tail.groups == 1 else None
+    if isinstance(tail, Conv) and tail.groups == 1 and tail.output == CORRECTION:
+        return tail
+    return None
 
 
 def _split(graph: Graph, head: Conv, add: Add, tail: Conv) -> Graph:

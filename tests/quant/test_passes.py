@@ -274,7 +274,8 @@ def test_all_passes_lose_far_less_than_none(
     last = rounded.core.ops[-1]
     assert isinstance(last, IntConv)
     assert len(last.weight) == 1
-    assert mae(quantized) < 0.6 * mae(rounded)
+    # The search also guards ground that is brighter than these patches.
+    assert mae(quantized) < 0.65 * mae(rounded)
 
 
 def test_each_step_is_named(float_onnx: onnx.ModelProto, patches: Patches) -> None:
@@ -282,9 +283,4 @@ def test_each_step_is_named(float_onnx: onnx.ModelProto, patches: Patches) -> No
     with reporting(reported.append), progress("calibrating"):
         quickly(float_onnx, patches)
     names = [step.what.removeprefix("calibrating: ") for step in reported]
-    assert [name.split(" ")[0] for name in names] == [
-        "scale",
-        "float",
-        "equalising",
-        "equalising",
-    ]
+    assert [name.split(" ")[0] for name in names] == ["scale", "float", "equalising"]

@@ -41,9 +41,8 @@ def test_unreachable_scales_are_moved_to_legal_ones(quantized: Quantized) -> Non
 
 def test_every_convolution_is_an_integer_kernel(quantized: Quantized) -> None:
     kinds = [node.op_type for node in quantized.host.graph.node]
-    # These are the head, two in each of two blocks, the end and the tail, and what the long skip
-    # is divided into: a second head and the pixel itself.
-    assert kinds.count("QLinearConv") == 9
+    # These are the head, two in each of two blocks, the end and the tail.
+    assert kinds.count("QLinearConv") == 7
     assert "Conv" not in kinds
 
 

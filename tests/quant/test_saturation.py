@@ -10,7 +10,6 @@ from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import CORRECTION
 from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.onnx_file import load_onnx
-from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.structure import rounded_tensors, saturated_shares
 from tests.quant.simplify.networks import parsed
 from tests.shipped import shipped_pair
@@ -98,16 +97,3 @@ def test_a_float_network_has_nothing_to_saturate() -> None:
     model = parsed("restored = Relu(image)", ENDS)
     assert rounded_tensors(model) == []
     assert saturated_shares(model, [IMAGE]) == {}
-
-
-def test_a_copy_of_the_image_is_exact_and_never_counts_as_clipped(quantized: Quantized) -> None:
-    every_dn = np.arange(4096, dtype=np.float32).reshape(1, 1, 64, 64) / 4095
-    planes = quantized.core.host_part.encode(every_dn)
-    tensors, _ = run_core(quantized.core, planes)
-    coarse, remainder, _ = planes[0].astype(np.int16)
-    (pixel,) = tensors["body_end.add.pixel"]
-    np.testing.assert_array_equal(pixel, [coarse, 4 * remainder])
-    assert pixel.max() == 127
-    shares = saturated_shares(quantized.host, [every_dn])
-    assert "head" in shares
-    assert not {"body_end.add.pixel", "body_end.add.join"} & shares.keys()

@@ -23,11 +23,13 @@ from beers_deploy.quant.graph import (
     read_planes,
     same,
 )
+from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.passes.long_skip import split_long_skips
 from beers_deploy.quant.passes.selection import ALL
-from beers_deploy.quant.quantize import quantize_model
+from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.simplify import simplify
+from beers_deploy.quant.structure import saturated_shares
 from examples.networks import to_onnx
 from tests.quant.quick import patches_of, waves
 
@@ -131,7 +133,8 @@ class Bright(nn.Module):
         return image + 0.02 * correction
 
 
-def test_int8_errs_less() -> None:
+def test_int8_errs_less(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("beers_deploy.quant.quantize.activates_sums", lambda _: True)
     network = Bright()
     generator = torch.Generator().manual_seed(3)
     with torch.no_grad():
@@ -143,11 +146,27 @@ def test_int8_errs_less() -> None:
     model = simplify(to_onnx("dncnn", network), "bright")
     *images, held_out = (0.1 + 0.8 * each for each in waves(5))
     in_float = result_of(open_session(model), held_out)
+    split, whole = (
+        quantize_model(model, patches_of(images), {}, passes=replace(ALL, long_skip=each))
+        for each in (True, False)
+    )
     errors = [
         np.abs(result_of(open_session(int8.host), held_out) - in_float).mean()
-        for int8 in (
-            quantize_model(model, patches_of(images), {}, passes=replace(ALL, long_skip=split))
-            for split in (True, False)
-        )
+        for int8 in (split, whole)
     ]
-    assert errors[0] < 0.7 * errors[1]
+    assert errors[0] < 0.8 * errors[1]
+    assert_pixel_is_exact(split)
+
+
+def assert_pixel_is_exact(int8: Quantized) -> None:
+    """The pixel's channels hold all 12 bits, and full scale does not count as clipped."""
+    every_dn = np.arange(4096, dtype=np.float32).reshape(1, 1, 64, 64) / 4095
+    planes = int8.core.host_part.encode(every_dn)
+    tensors, _ = run_core(int8.core, planes)
+    coarse, remainder, _ = planes[0].astype(np.int16)
+    (name,) = (name for name in tensors if name.endswith(".pixel"))
+    np.testing.assert_array_equal(tensors[name][0], [coarse, 4 * remainder])
+    assert tensors[name].max() == 127
+    counted = saturated_shares(int8.host, [every_dn])
+    assert counted
+    assert not [each for each in counted if each.endswith((".pixel", ".join"))]
