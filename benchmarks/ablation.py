@@ -69,7 +69,7 @@ def small(network: Small) -> Loss:
     int8 = network.path.with_suffix(".int8.onnx")
 
     def loss_of(passes: Passes) -> float:
-        save_onnx(quantize_model(model, patches, {}, passes=passes).host, int8)
+        save_onnx(quantize_model(model, patches, {}, passes=passes, brightens=True).host, int8)
         return float(network.losses_db(int8).mean())
 
     return loss_of

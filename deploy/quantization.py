@@ -190,8 +190,16 @@ def quantize_alone(
         if adapts:
             adapted = adapt(origin.model, calibration.drawn, calibration.unseen)
             about |= {ADAPTED: adapted.record} if adapted.record else {}
+        # Simulated patches already reach from dark ground to full scale.
+        own = isinstance(calibration, OwnSamples)
         result = quantize_model(
-            adapted.model, calibration.drawn, about, shifts, tuning, effort=effort
+            adapted.model,
+            calibration.drawn,
+            about,
+            shifts,
+            tuning,
+            effort=effort,
+            brightens=own,
         )
         step("statistics of each layer")
         layers = integer_rows(origin.model, result.core, result.host, calibration.drawn.degraded)

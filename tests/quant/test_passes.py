@@ -269,13 +269,12 @@ def test_all_passes_lose_far_less_than_none(
     def mae(int8: Quantized) -> float:
         return compare(open_session(float_onnx), open_session(int8.host), patches).mae
 
-    few = Passes(long_skip=False, dual_range=False, least_squares=False, equalization=False)
+    few = Passes(dual_range=False, least_squares=False, equalization=False)
     rounded = quantize_model(float_onnx, patches, {}, passes=few)
     last = rounded.core.ops[-1]
     assert isinstance(last, IntConv)
     assert len(last.weight) == 1
-    # The search also guards ground that is brighter than these patches.
-    assert mae(quantized) < 0.65 * mae(rounded)
+    assert mae(quantized) < 0.6 * mae(rounded)
 
 
 def test_each_step_is_named(float_onnx: onnx.ModelProto, patches: Patches) -> None:

@@ -121,7 +121,7 @@ def test_what_clips_nothing_pays_nothing_for_it_and_what_clips_much_does(
     """The price of clipping is near 0 for scales that clip nothing, and most of the loss for
     finer ones.
     """
-    passes = Passes(long_skip=False, dual_range=False, least_squares=False, equalization=False)
+    passes = Passes(dual_range=False, least_squares=False, equalization=False)
     unclipped = quickly(float_onnx, patches, passes=passes)
     images = without_references(patches)
     rows = price_rows(unclipped, images)

@@ -7,7 +7,7 @@ import pytest
 from beers_deploy.quant.core import build_core, shift_faults
 from beers_deploy.quant.encodings import board_model
 from beers_deploy.quant.gate import compare
-from beers_deploy.quant.graph import PLANES
+from beers_deploy.quant.graph import PLANES, Graph
 from beers_deploy.quant.onnx.graph import constants
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.quant.quantize import Quantized, quantize_model
@@ -34,9 +34,9 @@ def test_every_shift_is_within_its_window_and_one_that_is_not_is_named(
     assert any(fault.startswith("head: shift_cut") for fault in faults)
 
 
-def test_unreachable_scales_are_moved_to_legal_ones(quantized: Quantized) -> None:
+def test_unreachable_scales_are_moved_to_legal_ones(graph: Graph, quantized: Quantized) -> None:
     bits = {name: n + 20 * (name != PLANES) for name, n in quantized.core.frac_bits.items()}
-    assert shift_faults(build_core(quantized.graph, bits)) == []
+    assert shift_faults(build_core(graph, bits)) == []
 
 
 def test_every_convolution_is_an_integer_kernel(quantized: Quantized) -> None:

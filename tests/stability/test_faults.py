@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.core import IntConv, IntCore
-from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Concat
+from beers_deploy.quant.graph import CORRECTION, PLANES, Activation
 from beers_deploy.quant.host_part import IMAGE_SLICES
 from beers_deploy.quant.integer.reference import SOUND, Faults, merged_correction, run_core
 from beers_deploy.quant.quantize import Quantized
@@ -104,9 +104,7 @@ def test_flips_fall_into_the_weights_of_all_layers(core: IntCore) -> None:
 
 def test_every_shift_is_what_the_core_uses(core: IntCore) -> None:
     shifts = shifts_of(core)
-    # A concat's inputs have its scale, so it shifts nothing.
-    shifting = [op for op in core.ops if not isinstance(op, Concat)]
-    assert len(shifts) == sum(2 if isinstance(op, IntConv) else 1 for op in shifting)
+    assert len(shifts) == sum(2 if isinstance(op, IntConv) else 1 for op in core.ops)
     limit = 2 ** (SHIFT_BITS - 1)
     assert all(-limit <= shift < limit for shift in shifts.values())
     injected = flip_shifts(shifts, 3, np.random.default_rng(2))
