@@ -1,8 +1,8 @@
 """Quantise a network in one call: float ONNX and calibration patches in, the integer core and its
 file for the host out.
 
-1. Read the network, let it read bit planes, and take the image out of the long skip connections of
-   distillation networks.
+1. Read the network, let it read bit planes, and take the image out of the long skip connection of a
+   distillation network.
 2. Find the residual groups and the single tensors, whose channels may be scaled.
 3. Choose the scale of each tensor by least squares.
 4. Exclude groups in which int8 could not end at a ReLU6's six.
@@ -67,7 +67,7 @@ from beers_deploy.quant.passes.equalize_single import (
     single_ranges,
 )
 from beers_deploy.quant.passes.least_squares import choose_frac_bits
-from beers_deploy.quant.passes.long_skip import activates_sums, split_long_skips
+from beers_deploy.quant.passes.long_skip import activates_sums, split_long_skip
 from beers_deploy.quant.passes.residual_groups import (
     GROUP_FRAC_BITS,
     ResidualGroup,
@@ -228,7 +228,7 @@ def quantize_model(
     # Without a global add the result contains the image, which int8 has to represent anyway. In a
     # plain residual stream the search then clips more, which the gate counts.
     if passes.long_skip and network.adds_image and activates_sums(graph):
-        graph = split_long_skips(graph)
+        graph = split_long_skip(graph)
     if passes.dual_range and network.adds_image and can_write_copies(graph):
         host_part = replace(host_part, decoding=DualRange())
     # 2.

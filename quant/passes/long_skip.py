@@ -42,25 +42,24 @@ are exact: no value is clipped, and none is a tie that boards and processors rou
 """
 
 
-def split_long_skips(graph: Graph) -> Graph:
-    """Return the graph in which no sum that the last convolution alone reads contains the image.
+def split_long_skip(graph: Graph) -> Graph:
+    """Return the graph whose last convolution reads the image beside a sum of details.
 
     Args:
         graph: a float graph that reads the int8 planes that an image is split into.
 
     Returns:
-        The graph; `graph` itself if it has no such sum.
+        The graph; `graph` itself if no sum that the last convolution alone reads contains the head.
     """
-    result = graph
     for add in graph:
         if isinstance(add, Add) and add.activation is Activation.none:
-            head = _head(result, add)
-            tail = _tail(result, add)
+            head = _head(graph, add)
+            tail = _tail(graph, add)
             if head is not None and tail is not None:
                 # Weights that overflow are refused where the float network is run.
                 with np.errstate(over="ignore", invalid="ignore"):
-                    result = _split(result, head, add, tail)
-    return result
+                    return _split(graph, head, add, tail)
+    return graph
 
 
 def activates_sums(graph: Graph) -> bool:

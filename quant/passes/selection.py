@@ -11,7 +11,7 @@ class Passes:
     gain.
 
     Attributes:
-        long_skip: True takes the image out of long skip connections.
+        long_skip: True takes the image out of the long skip connection of a distillation network.
         dual_range: True writes the result in several copies of different scales, which represent it
             more finely than one.
         least_squares: True chooses the scale of least squared error for each tensor, False the

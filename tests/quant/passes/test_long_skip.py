@@ -24,7 +24,7 @@ from beers_deploy.quant.graph import (
     same,
 )
 from beers_deploy.quant.integer.reference import run_core
-from beers_deploy.quant.passes.long_skip import split_long_skips
+from beers_deploy.quant.passes.long_skip import split_long_skip
 from beers_deploy.quant.passes.selection import ALL
 from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.session import open_session, result_of
@@ -69,7 +69,7 @@ def test_the_float_network_stays_also_at_the_border(
     seed: int, channels: int, head: int, tail: int
 ) -> None:
     graph = skipping(seed, channels, head, tail)
-    split = split_long_skips(graph)
+    split = split_long_skip(graph)
     assert len(split) == len(graph) + 3
     (before,) = run(graph, [CORRECTION], channels)
     (after,) = run(split, [CORRECTION], channels)
@@ -77,7 +77,7 @@ def test_the_float_network_stays_also_at_the_border(
 
 
 def test_the_sum_no_longer_follows_the_brightness_of_the_ground() -> None:
-    split = split_long_skips(skipping(0))
+    split = split_long_skip(skipping(0))
     session = open_session(graph_to_onnx(split, ["sum.head"], 3))
     inner = []
     for level in (0.1, 0.9):
@@ -89,7 +89,7 @@ def test_the_sum_no_longer_follows_the_brightness_of_the_ground() -> None:
 def test_a_head_that_nothing_else_reads_is_replaced() -> None:
     first, body, *others = skipping(0)
     graph = (first, replace(body, input=PLANES, weight=body.weight[:, :3]), *others)  # type: ignore[type-var, attr-defined]
-    split = split_long_skips(graph)
+    split = split_long_skip(graph)
     assert "head" not in {op.output for op in split}
     (before,) = run(graph, [CORRECTION])
     (after,) = run(split, [CORRECTION])
@@ -115,7 +115,7 @@ def spoilt() -> dict[str, Graph]:
 @pytest.mark.parametrize("name", spoilt())
 def test_other_sums_are_left_alone(name: str) -> None:
     graph = spoilt()[name]
-    assert split_long_skips(graph) is graph
+    assert split_long_skip(graph) is graph
 
 
 class Bright(nn.Module):
