@@ -6,10 +6,15 @@ from dataclasses import fields, replace
 import numpy as np
 import onnx
 import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
 
 from beers_deploy.quant.passes.selection import ALL, Passes
 from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.session import open_session, result_of
+from beers_deploy.quant.simplify.simplify import simplify
+from examples.networks import DPU_SLOPE, to_onnx
 from tests.quant.quick import patches_of
 from tests.quant.test_odd_networks import VALID
 
@@ -26,15 +31,36 @@ def waves(phase: int) -> np.ndarray:
     return np.asarray(image, np.float32)[None, None]
 
 
+class Distilling(nn.Module):
+    """A distillation network of one step: an activation behind a sum, and a long skip."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.head = nn.Conv2d(1, 4, 3, padding=1)
+        self.refine = nn.Conv2d(4, 4, 3, padding=1)
+        self.smooth = nn.Conv2d(4, 4, 3, padding=1)
+        self.tail = nn.Conv2d(4, 1, 3, padding=1)
+        generator = torch.Generator().manual_seed(0)
+        for numbers in self.parameters():
+            nn.init.uniform_(numbers, -0.3, 0.3, generator=generator)
+
+    def forward(self, image: Tensor) -> Tensor:
+        head = self.head(image)
+        refined = functional.leaky_relu(self.refine(head) + head, DPU_SLOPE)
+        correction: Tensor = self.tail(self.smooth(refined) + head)
+        return image + correction
+
+
 @pytest.fixture(scope="module")
 def results(float_onnx: onnx.ModelProto) -> Results:
-    """What two networks restore once quantised: one adds to the image, through the other it passes
-    itself.
+    """What three networks restore once quantised: one adds to the image, through another it passes
+    itself, and one is a distillation network.
     """
+    distilling = simplify(to_onnx("dncnn", Distilling()), "distilling")
     patches = patches_of([waves(phase) for phase in range(3)])
 
     def of_passes(passes: Passes) -> list[np.ndarray]:
-        networks = (float_onnx, VALID["dead channels"])
+        networks = (float_onnx, VALID["dead channels"], distilling)
         files = [quantize_model(network, patches, {}, passes=passes).host for network in networks]
         return [result_of(open_session(file), waves(0)) for file in files]
 
@@ -50,6 +76,6 @@ def with_all(results: Results) -> list[np.ndarray]:
 def test_each_pass_can_be_left_out_and_then_the_integers_are_others(
     name: str, results: Results, with_all: list[np.ndarray]
 ) -> None:
-    """On one of two networks at least: no pass serves both."""
+    """On one of the networks at least: no pass serves all."""
     without = results(replace(ALL, **{name: False}))
     assert any((one != other).any() for one, other in zip(with_all, without, strict=True))
