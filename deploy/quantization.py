@@ -26,7 +26,7 @@ from beers_deploy.profiles.shipped import REFERENCE, board_names, npu_names
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.adapt.adaptation import ADAPTED, Adapted, adapt
 from beers_deploy.quant.core import SHIFTS, Shifts, target_shifts
-from beers_deploy.quant.encodings import host_model, read_core
+from beers_deploy.quant.encodings import SENSOR_BIASES, host_model, read_core
 from beers_deploy.quant.gate import GateResult, compare, gate_row
 from beers_deploy.quant.integer.agreement import integer_rows
 from beers_deploy.quant.onnx_file import faults_named, load_onnx, metadata, require_quantized
@@ -41,11 +41,7 @@ from beers_deploy.quant.sensitivity import (
     sizes_row,
     worst_row,
 )
-from beers_deploy.quant.sensor_bank.conditioned import (
-    SENSOR_BIASES,
-    WEIGHTS,
-    required_conditioned_core,
-)
+from beers_deploy.quant.sensor_bank.conditioned import WEIGHTS, required_conditioned_core
 from beers_deploy.quant.session import open_any_size
 from beers_deploy.quant.untrusted import contradictions
 from beers_deploy.report.page import Report

@@ -21,7 +21,7 @@ from beers_deploy.network_files import other_sensor
 from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.shipped import BLIND, TILE_PX
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.quant.encodings import save_config
+from beers_deploy.quant.encodings import require_undamaged, save_config
 from beers_deploy.quant.session import open_session, tensors_of
 from beers_deploy.tables.markdown import markdown_text
 
@@ -83,13 +83,15 @@ class Board(TargetProfile):
 
         Raises:
             MissingExtraError: a record is requested, and cyclonedx-python-lib is not installed.
-            ModelError: the network is float, or was not quantised under a DPU's rules here.
+            ModelError: the network is float, damaged, or was not quantised under a DPU's rules
+                here.
             OptionError: the sensor would change nothing.
             ProfileError: there is no such sensor.
         """
         profile = None if sensor is None else Sensor.load(sensor)
         images_of = profile or Sensor.load(BLIND)
         network = conditioned_on(Network.load(int8, sensor=images_of), images_of)
+        require_undamaged(network.model, network.label)
         folder = Path(out)
         warning = other_sensor(network.model, images_of)
         if warning:

@@ -14,6 +14,7 @@ factors. The script needs NumPy, host.json and onnxruntime; a board needs other 
    raw one at low spatial frequencies, if host.json has its weights.
 4. Then the self-check (`judged`) blurs the result as the sensor blurs and compares it with the raw
    image, block by block. restored-check.npy holds its two figures of each block.
+5. Each core restores a drawn tile (`known_tile`), whose checksum is compared with known.json.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import argparse
 import itertools
 import json
 import sys
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -44,10 +46,7 @@ UNITS = {1.0: S["unit"], **{float(factor): unit for factor, unit in S["exposures
 
 
 def shuffled(x: np.ndarray, r: int, up: bool) -> np.ndarray:
-    """Move squares of r x r pixels of (1, C, H, W) into the channels: (1, C r^2, H / r, W / r).
-
-    If `up`, move channels back into pixels: (1, C / r^2, r H, r W).
-    """
+    """Move squares of r x r pixels of (1, C, H, W) into the channels, or back if `up`."""
     _, c, h, w = x.shape
     if up:
         c = c // r**2
@@ -71,11 +70,6 @@ def encoded(image: np.ndarray) -> np.ndarray:
     return np.concatenate([coarse] * S["coarse_planes"] + [rest, parts], 1) / F(128)
 
 
-def plain(value: np.ndarray) -> np.ndarray:
-    """Decode a result of which the core writes only one copy: return it unchanged."""
-    return value
-
-
 def fits(fine: np.ndarray) -> np.ndarray:
     """Return True for the values of a copy in fine steps that the limits of int8 do not clip."""
     return np.asarray(np.abs(fine) <= F(S["fine_max"]))
@@ -87,10 +81,7 @@ def dual_range(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
 
 
 def offset_windows(coarse: np.ndarray, *windows: np.ndarray) -> np.ndarray:
-    """Merge a coarse copy (1, C, h, w) of a result with copies in fine steps around offsets.
-
-    A value is taken from the last window that does not clip it, or else from the coarse copy.
-    """
+    """Merge a coarse copy with windows, copies in fine steps around offsets: the last that fits."""
     value = coarse * F(S["gain"])
     for window, offset in zip(windows, S["offsets"]):  # noqa: B905 - a board's Python may be old
         value = np.where(fits(window), window + np.array(offset, F)[:, None, None], value)
@@ -107,7 +98,7 @@ def bank_sum(fine: np.ndarray, coarse: np.ndarray, *analytic: np.ndarray) -> np.
 
 
 DECODINGS: dict[str, Any] = {
-    "plain": plain,
+    "plain": np.asarray,
     "dual range": dual_range,
     "offset windows": offset_windows,
     "bank sum": bank_sum,
@@ -118,8 +109,7 @@ DECODINGS: dict[str, Any] = {
 def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
     """Restore a tile (1, C, h, w) by one core: encode it, decode the result, and add the tile.
 
-    `run` computes the core's result (1, copies C', h', w') from the planes, and `unit` is the share
-    of full scale that is 1 in the decoded result.
+    `run` computes the core's result from planes, of which `unit` is the share of full scale of 1.
     """
     copies = np.split(run(encoded(image)), S["copies"], 1)
     value = shuffled(DECODINGS[S["decoding"]](*copies), S["back"], up=True) * F(unit)
@@ -227,9 +217,8 @@ def detail(raw: np.ndarray, near: np.ndarray) -> np.ndarray:
 def judged(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Compute the self-check of one band (H, W): two figures (2, n, m) of blocks of CHECK pixels.
 
-    The first is chi2: raw - H x, squared, over the variance that noise alone has, of single pixels
-    or of sums over small cells. The second is the mean of (x - H x)^2 / variance, which shows
-    whether a wrong restoration would be detected. Both are NaN where too few pixels count.
+    The first is chi2, (raw - H x)^2 over the variance of noise, of pixels or of sums over cells.
+    The second is the mean of (x - H x)^2 / variance. Both are NaN where too few pixels count.
     """
     facts = S["self_check"]
     kernel = np.array(facts["rows"], F).T @ np.array(facts["columns"], F)
@@ -285,10 +274,7 @@ def extended(x: np.ndarray, margin: int) -> np.ndarray:
 
 
 def summed(x: np.ndarray, row: np.ndarray, column: np.ndarray, side: int = BLOCK) -> np.ndarray:
-    """Compute the weighted sum of a window of each block of `side` pixels of an image (H, W).
-
-    The image reaches beyond the blocks by what the weights of rows and columns need.
-    """
+    """Compute the weighted sum of a window of each block of an image that reaches beyond them."""
     for weights in (row, column):
         end = x.shape[0] - len(weights) + 1
         x = sum(x[place : place + end : side] * weight for place, weight in enumerate(weights)).T
@@ -319,8 +305,7 @@ def inner(count: int) -> tuple[int, int]:
 def interpolated(blocks: np.ndarray, shape: tuple[int, ...], side: int = BLOCK) -> np.ndarray:
     """Interpolate bilinearly between the centres of blocks of `side` pixels, to (H, W) = `shape`.
 
-    Blocks at the image's border are left out, because H brings light into them that the image does
-    not show. Nearer to the border the nearest block inside counts.
+    Blocks at the border, into which H brings light from outside, are left out for the nearest one.
     """
     for size in shape:
         place = np.arange(size) - side // 2
@@ -331,11 +316,25 @@ def interpolated(blocks: np.ndarray, shape: tuple[int, ...], side: int = BLOCK) 
     return blocks
 
 
-def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
-    """Return the start of each tile along `size` pixels, and start and end of its retained pixels.
+def known_tile(runs: dict[float, Any], channels: int) -> str:
+    """Restore a drawn tile by each core, and compare its checksum with that of the first run.
 
-    Tiles overlap by at least two halos, the pixels that are discarded at a tile's inner borders.
+    A difference is a flipped bit in a core's weights, which an image's noise may hide.
     """
+    side = S["tile_px"]
+    tile = np.random.default_rng(0).random((1, channels, side, side), F)
+    crcs = {f"{f:g}": zlib.crc32(exposed(f, tile, run).tobytes()) for f, run in runs.items()}
+    path = HERE / "known.json"
+    if not path.exists():
+        path.write_text(json.dumps(crcs), encoding="utf-8")
+    first = json.loads(path.read_text(encoding="utf-8"))
+    wrong = ", ".join(f"x{factor}" for factor, crc in crcs.items() if first.get(factor) != crc)
+    how = f"otherwise by {wrong}, whose weights must be loaded again" if wrong else "as at first"
+    return f"known tile: restored {how}\n"
+
+
+def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
+    """Return the start of each tile along `size` pixels, and start and end of what it retains."""
     starts = [*range(0, size - tile, tile - 2 * halo), size - tile]
     return [
         (s, s and s + halo, starts[k + 1] + halo if s < size - tile else size)
@@ -374,6 +373,7 @@ def main(source: str, target: str, runs: dict[float, Any]) -> None:
         path = Path(target)
         np.save(path.with_name(f"{path.stem}-check.npy"), blocks)
         sys.stdout.write(report(blocks))
+    sys.stdout.write(known_tile(runs, len(image)))
 
 
 def cores() -> dict[float, Any]:

@@ -20,9 +20,9 @@ from beers_deploy.network_files import int8_for_sensor
 from beers_deploy.profiles.errors import ModelError, one_line, optional, printable
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.quant.encodings.description import KEY
+from beers_deploy.quant.encodings import CORE, SENSOR_BIASES
 from beers_deploy.quant.onnx_file import load_onnx, metadata
-from beers_deploy.quant.sensor_bank.conditioned import SENSOR_BIASES, WEIGHTS, conditioned_core
+from beers_deploy.quant.sensor_bank.conditioned import WEIGHTS, conditioned_core
 from beers_deploy.report.page import Report, Section, render
 from beers_deploy.results import Table
 
@@ -40,7 +40,7 @@ LIMITATIONS = (
         "judged."
     ),
 )
-BULKY = {KEY, SENSOR_BIASES}
+BULKY = {CORE, SENSOR_BIASES}
 """Metadata of a file that holds long lists of numbers, which the record omits."""
 
 

@@ -15,23 +15,27 @@ from beers_deploy.quant.encodings.board import (
     save_config,
     vint8_model,
 )
-from beers_deploy.quant.encodings.description import BORDER_PX, PLACE_PX
+from beers_deploy.quant.encodings.checksum import CHECKSUM, require_undamaged
+from beers_deploy.quant.encodings.description import BORDER_PX, PLACE_PX, SENSOR_BIASES
 from beers_deploy.quant.encodings.description import KEY as CORE
 from beers_deploy.quant.encodings.explicit import implicit_parts
 from beers_deploy.quant.encodings.host import encoding_faults, host_model, read_core
 
 __all__ = [
     "BORDER_PX",
+    "CHECKSUM",
     "CONFIG",
     "CORE",
     "OF_NPU",
     "PLACE_PX",
+    "SENSOR_BIASES",
     "as_on_board",
     "board_model",
     "encoding_faults",
     "host_model",
     "implicit_parts",
     "read_core",
+    "require_undamaged",
     "required_tile",
     "save_config",
     "vint8_model",

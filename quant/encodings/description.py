@@ -32,6 +32,8 @@ from beers_deploy.quant.host_part import host_part_from_json, host_part_to_json
 from beers_deploy.quant.untrusted import DAMAGE
 
 KEY = "core"
+SENSOR_BIASES = "family"
+"""The metadata key of the biases by which a file is conditioned on a sensor."""
 PLACE_PX = "place_px"
 """The metadata key in a board's file of the side in pixels of the square of the image that is one
 place of its planes; 1 if it is missing.

@@ -24,6 +24,7 @@ from onnx import TensorProto
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.domains import MICROSOFT
+from beers_deploy.quant.encodings.checksum import CHECKSUM, checksum
 from beers_deploy.quant.encodings.description import KEY, describe, described_core, phases
 from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
 from beers_deploy.quant.graph import (
@@ -81,7 +82,9 @@ def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None)
         [image_info(IMAGE, core.host_part.image_channels, tile_px)],
         [_result(core, tile_px)],
     )
-    return make_model(graph, {**about, KEY: describe(core)}, microsoft=True)
+    model = make_model(graph, {**about, KEY: describe(core)}, microsoft=True)
+    onnx.helper.set_model_props(model, {**metadata(model), CHECKSUM: checksum(model)})
+    return model
 
 
 def part_model(core: IntCore, start: int, stop: int) -> onnx.ModelProto:

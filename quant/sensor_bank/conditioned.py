@@ -29,7 +29,7 @@ from beers_deploy.model.variants import SENSOR_VALUES, Kernels
 from beers_deploy.profiles.errors import ModelError, reason_of
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, Shifts, quantize_bias
-from beers_deploy.quant.encodings import read_core
+from beers_deploy.quant.encodings import SENSOR_BIASES, read_core
 from beers_deploy.quant.graph import PLANES, Op
 from beers_deploy.quant.host_part import BankSum
 from beers_deploy.quant.onnx_file import metadata
@@ -38,8 +38,6 @@ from beers_deploy.quant.untrusted import DAMAGE, contradictions
 
 WEIGHTS = "weights_sha256"
 """The key of the SHA-256 of the float weights, in the metadata of an INT8 network behind a bank."""
-SENSOR_BIASES = "family"
-"""The key of `ConditionedCore.biases`, in the same metadata."""
 
 BANK = "bank"
 """The tensor between a sensor's filters and the layers that are the same for all."""

@@ -19,9 +19,10 @@ from beers_deploy import comparison
 from beers_deploy.kit.record import bill_of, record_of, write_record
 from beers_deploy.network import Network
 from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.quant.encodings import SENSOR_BIASES
 from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
 from beers_deploy.quant.samples.own import CALIBRATED_ON
-from beers_deploy.quant.sensor_bank.conditioned import SENSOR_BIASES, WEIGHTS
+from beers_deploy.quant.sensor_bank.conditioned import WEIGHTS
 from beers_deploy.results import Table
 from tests.deploy.command_line import done, refused
 from tests.quant.quick import change

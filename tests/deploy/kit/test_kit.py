@@ -34,6 +34,7 @@ from beers_deploy.profiles.response import MtfTable
 from beers_deploy.profiles.sensor_file import axes_of
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.sensor_bank.calibrate import bank_results, quantize_behind_bank
+from beers_deploy.quant.session import open_session, tensors_of
 from tests.deploy.command_line import done
 from tests.deploy.kit.test_golden import NORMALISED, network
 from tests.model.networks import behind_a_bank
@@ -231,6 +232,25 @@ def test_the_host_part_judges_blocks_as_the_library_does(
     host = runpy.run_path(str(kit / "host.py"))
     count = f"{expected.outside.sum()} of {expected.decidable.sum()} decidable blocks"
     assert count in host["report"](blocks)
+
+
+def test_a_flipped_weight_of_any_core_shows_in_the_known_tile(kit: Path) -> None:
+    """The first run writes the checksums, and a later run names each core that differs from them.
+
+    In the noise of an image the flip of a low bit would disappear.
+    """
+    host = runpy.run_path(str(kit / "host.py"))
+    runs = host["cores"]()
+    host["known_tile"](runs, 1)
+    assert host["known_tile"](runs, 1) == "known tile: restored as at first\n"
+    core = onnx.load(kit / "core-x4.onnx")
+    weights = max(core.graph.initializer, key=lambda tensor: len(tensor.raw_data))
+    content = bytearray(weights.raw_data)
+    content[len(content) // 2] ^= 1
+    weights.raw_data = bytes(content)
+    session = open_session(core)
+    runs[4.0] = lambda planes: tensors_of(session, None, planes)[0]
+    assert "restored otherwise by x4, whose weights" in host["known_tile"](runs, 1)
 
 
 def test_a_sensor_that_does_not_exist_or_changes_nothing_is_one_sentence(tmp_path: Path) -> None:

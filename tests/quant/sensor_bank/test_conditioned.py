@@ -20,11 +20,16 @@ from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.core import IntConv, IntCore, shift_faults
-from beers_deploy.quant.encodings import board_model, encoding_faults, host_model, read_core
+from beers_deploy.quant.encodings import (
+    SENSOR_BIASES,
+    board_model,
+    encoding_faults,
+    host_model,
+    read_core,
+)
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.sensor_bank.calibrate import bank_results, map_steps, quantize_behind_bank
 from beers_deploy.quant.sensor_bank.conditioned import (
-    SENSOR_BIASES,
     ConditionedCore,
     delta_of_file,
     required_conditioned_core,
