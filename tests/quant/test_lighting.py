@@ -1,4 +1,6 @@
-"""Calibration and gate patches cover the sensor's range, in the stated shares."""
+"""Calibration and gate patches cover the sensor's range in the stated shares, and scales hold
+ground that is brighter than a user's own samples.
+"""
 
 from collections import Counter
 from dataclasses import replace
@@ -10,6 +12,7 @@ from hypothesis import strategies as st
 
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.quant.onnx_file import GraphWriter
 from beers_deploy.quant.samples.coverage import histogram, range_from
 from beers_deploy.quant.samples.simulated import Calibration, draw_patches, unseen_patches
 from beers_deploy.quant.samples.views import (
@@ -19,6 +22,8 @@ from beers_deploy.quant.samples.views import (
     assign_lightings,
     light_factor,
 )
+from beers_deploy.quant.session import open_session, run
+from tests.quant.quick import behind_conv, patches_of, quickly, waves, without_references
 
 SENSOR = Sensor.load("pleiades-degraded")
 REFERENCE = Sensor.load("pleiades-reference")
@@ -91,3 +96,25 @@ def test_light_changes_nothing_but_the_light() -> None:
     assert len(ratios) > 4
     repeated = draw_patches(scenes, SENSOR, REFERENCE, 16, 3, 40, lightings=JUDGING)
     assert repeated.digest == lit.digest != plain.digest
+
+
+def test_scales_hold_ground_that_is_brighter_than_the_samples() -> None:
+    """Behind HardSwish no factor of the search is passed on, so that its scales alone can hold it.
+
+    The samples have a tenth of the light of the image that is judged.
+    """
+
+    def write(writer: GraphWriter) -> None:
+        weight = writer.constant("v", np.full((1, 2, 1, 1), 0.5, np.float32))
+        writer.node("HardSwish", "y", ["x"], "activation")
+        writer.node("Conv", "restored", ["y", weight], "last")
+
+    model = behind_conv(write)
+    (bright,) = waves(1)
+    expected = run(open_session(model), bright)
+    patches = without_references(patches_of([np.float32(0.1) * image for image in waves()]))
+    errors = []
+    for brightens in (True, False):
+        result = run(open_session(quickly(model, patches, brightens=brightens).host), bright)
+        errors.append(np.abs(result - expected).max())
+    assert 10 * errors[0] < errors[1]
