@@ -37,18 +37,27 @@ def checksum(model: onnx.ModelProto) -> str:
     return digest.hexdigest()
 
 
+def is_damaged(model: onnx.ModelProto) -> bool:
+    """Return True if an INT8 file states a checksum that is not that of its integers.
+
+    A float file, and one that another program wrote, states none.
+
+    Args:
+        model: the content of the file.
+    """
+    stated = metadata(model).get(CHECKSUM)
+    return stated is not None and stated != checksum(model)
+
+
 def require_undamaged(model: onnx.ModelProto, name: str) -> None:
     """Raise ModelError if an INT8 file was changed after it was written.
-
-    A float file, and one that another program wrote, states no checksum and passes.
 
     Args:
         model: the content of the file.
         name: the name of the network, for the message.
     """
-    stated = metadata(model).get(CHECKSUM)
-    if stated is not None and stated != checksum(model):
+    if is_damaged(model):
         raise ModelError(
-            f"The INT8 file of {name} is damaged: its integers are not those of its checksum "
-            f"{stated[:12]}. Copy the file again, or make it again with 'beers-deploy quantize'."
+            f"The INT8 file of {name} is damaged: its integers are not those of its checksum. Copy "
+            "the file again, or make it again with 'beers-deploy quantize'."
         )

@@ -17,7 +17,7 @@ from beers_deploy.network import Network
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.encodings import CHECKSUM, CORE, SENSOR_BIASES, require_undamaged
 from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
-from tests.deploy.command_line import refused
+from tests.deploy.command_line import done, refused
 from tests.deploy.restoration.runs import noise
 
 NAME = f"convbeers-xs{INT8}"
@@ -74,7 +74,7 @@ def test_files_as_written_pass() -> None:
 @pytest.mark.parametrize("sensor", ["", SENSOR])
 def test_a_damaged_file_restores_nothing(sensor: str, tmp_path: Path) -> None:
     """Neither as it is stored, nor conditioned on a sensor, whose file would have a new checksum;
-    and no kit is made of it.
+    no kit is made of it, and no gate passes it.
     """
     stored = Network.load(NAME, sensor=sensor).model if sensor else STORED
     path = tmp_path / "damaged.onnx"
@@ -86,3 +86,8 @@ def test_a_damaged_file_restores_nothing(sensor: str, tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=MESSAGE):
         bd.Board.load("vck190").kit(path, tmp_path / "kit", tile=64, sensor=SENSOR)
     assert {*tmp_path.iterdir()} == {path, image}
+    gate = f"gate convbeers-xs {path} --patches 1"
+    if sensor:
+        assert "the checksum of the integers" in done(gate, code=1)
+    else:
+        assert MESSAGE in refused(gate)
