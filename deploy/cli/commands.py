@@ -116,12 +116,31 @@ class Group(TyperGroup):
         """Run the chosen command. Exit with 70 if some of its standard output was lost."""
         closed = sys.stdout is None
         with lasting_streams(self.results_on_stdout) as out:
-            result = super().invoke(ctx)
+            try:
+                result = super().invoke(ctx)
+            except typer.BadParameter as error:
+                error.message = with_value(error)
+                raise
         if out.lost or (closed and self.results_on_stdout):
             reason = out.lost or "closed"
             typer.echo(f"beers-deploy: standard output: {reason}; all else is done", err=True)
             ctx.exit(CRASHED)
         return result
+
+
+def with_value(error: typer.BadParameter) -> str:
+    """Return the message on a value that an option does not accept, with that value.
+
+    Args:
+        error: Typer's error, which pydantic caused in most cases.
+    """
+    faults = getattr(error.__cause__, "errors", list)()
+    if not faults:
+        return error.message
+    reason = faults[0]["msg"].removeprefix("Value error, ").partition(", unable to parse")[0]
+    reason = reason.replace("Input should be", "it must be")
+    value = repr(faults[0]["input"])
+    return reason if value in reason else f"{reason}, got {value}."
 
 
 app = typer.Typer(

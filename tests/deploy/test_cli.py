@@ -89,6 +89,19 @@ def test_only_what_is_needed_is_imported(code: str, packages: set[str]) -> None:
     assert process.stdout.splitlines()[-1] == "set()"
 
 
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        ("--tile abc", "'--tile': it must be a valid integer, got 'abc'."),
+        ("--tile 7", "'--tile': it must be greater than or equal to 16, got '7'."),
+        ("--memory 5x", "'--memory': it must be a valid number, got '5x'."),
+        ("--runtime torch", "'--runtime': 'torch' is not one of 'onnxruntime', 'openvino'."),
+    ],
+)
+def test_a_value_that_an_option_does_not_accept_is_named(words: str, reason: str) -> None:
+    assert refused(f"restore raw.tif out.tif {words}").endswith(f"Invalid value for {reason}")
+
+
 def test_version() -> None:
     assert runner.invoke(app, ["--version"]).output == f"beers-deploy {__version__}\n"
 
