@@ -235,14 +235,16 @@ def test_the_host_part_judges_blocks_as_the_library_does(
 
 
 def test_a_flipped_weight_of_any_core_shows_in_the_known_tile(kit: Path) -> None:
-    """The first run writes the checksums, and a later run names each core that differs from them.
+    """A run that learns writes the checksums, and later ones name each core that differs from them.
 
     In the noise of an image the flip of a low bit would disappear.
     """
     host = runpy.run_path(str(kit / "host.py"))
     runs = host["cores"]()
-    host["known_tile"](runs, 1)
-    assert host["known_tile"](runs, 1) == "known tile: restored as at first\n"
+    known_tile = host["known_tile"]
+    assert known_tile(runs, 1, False) == "known tile: not learnt\n"
+    for learn in (True, False):
+        assert known_tile(runs, 1, learn) == "known tile: restored as learnt\n"
     core = onnx.load(kit / "core-x4.onnx")
     weights = max(core.graph.initializer, key=lambda tensor: len(tensor.raw_data))
     content = bytearray(weights.raw_data)
@@ -250,7 +252,7 @@ def test_a_flipped_weight_of_any_core_shows_in_the_known_tile(kit: Path) -> None
     weights.raw_data = bytes(content)
     session = open_session(core)
     runs[4.0] = lambda planes: tensors_of(session, None, planes)[0]
-    assert "restored otherwise by x4, whose weights" in host["known_tile"](runs, 1)
+    assert "restored otherwise by x4, whose weights" in known_tile(runs, 1, False)
 
 
 def test_a_sensor_that_does_not_exist_or_changes_nothing_is_one_sentence(tmp_path: Path) -> None:
