@@ -6,6 +6,7 @@ sensors. Behind six sensors with an MTF of 7 % at Nyquist, it restored ten photo
 worse than conditioned on them (measured).
 
 `Network.load` returns the file as it is stored, because `gate` and `check` judge its own encoding.
+They and `stress` also judge a damaged file, which is not run elsewhere.
 """
 
 from dataclasses import replace
@@ -14,6 +15,21 @@ from beers_deploy.network import Network
 from beers_deploy.network_files import ConditionedFile, serves_every_sensor, warn_outside
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND
+from beers_deploy.quant.encodings import require_undamaged
+
+
+def to_run_on(network: Network, sensor: Sensor) -> Network:
+    """Return the network that restores images of a sensor, as `conditioned_on` does.
+
+    Args:
+        network: any network.
+        sensor: the sensor of the images.
+
+    Raises:
+        ModelError: the network is an INT8 file that was damaged after it was written.
+    """
+    require_undamaged(network.model, network.label)
+    return conditioned_on(network, sensor)
 
 
 def conditioned_on(network: Network, sensor: Sensor) -> Network:

@@ -29,7 +29,7 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND, BLIND_PROFILE
 from beers_deploy.profiles.toml import unreadable
-from beers_deploy.quant.encodings import SENSOR_BIASES, host_model, require_undamaged
+from beers_deploy.quant.encodings import SENSOR_BIASES, host_model, with_damage_of
 from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata
 from beers_deploy.quant.sensor_bank.conditioned import required_conditioned_core, with_delta
 
@@ -237,10 +237,8 @@ def int8_for_sensor(
         A new ONNX model, which accepts the same image sizes as `model`.
 
     Raises:
-        ModelError: `model` is damaged, or cannot be conditioned on a sensor.
+        ModelError: `model` cannot be conditioned on a sensor.
     """
-    # The file for the sensor gets a checksum of its own, which must not cover damage.
-    require_undamaged(model, "the network for every sensor")
     stored = required_conditioned_core(model)
     instrument = brightened(sensor, exposure.gain).nominal()
     core = stored.for_sensor(
@@ -249,9 +247,8 @@ def int8_for_sensor(
         exposure.finer,
         instrument.offset_dn / instrument.max_dn,
     )
-    return host_model(
-        core, {**metadata(model), "sensor": sensor.name, **(more or {})}, fixed_tile_px(model)
-    )
+    about = {**metadata(model), "sensor": sensor.name, **(more or {})}
+    return with_damage_of(model, host_model(core, about, fixed_tile_px(model)))
 
 
 def int8_for_delta(model: onnx.ModelProto, delta: Path) -> onnx.ModelProto:
@@ -279,6 +276,6 @@ def int8_for_delta(model: onnx.ModelProto, delta: Path) -> onnx.ModelProto:
             f"The delta {delta} cannot be read: {unreadable(delta) or error}. Give a file that "
             "'export --delta' wrote."
         ) from error
-    require_undamaged(model, "the network of the delta")
     core, name = with_delta(required_conditioned_core(model).core, packed, str(delta))
-    return host_model(core, {**metadata(model), "sensor": name}, fixed_tile_px(model))
+    about = {**metadata(model), "sensor": name}
+    return with_damage_of(model, host_model(core, about, fixed_tile_px(model)))

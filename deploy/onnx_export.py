@@ -19,7 +19,7 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.c_code import c_program
-from beers_deploy.quant.encodings import host_model, read_core, required_tile
+from beers_deploy.quant.encodings import host_model, read_core, require_undamaged, required_tile
 from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
 from beers_deploy.quant.sensor_bank.conditioned import delta_of_file, required_conditioned_core
 
@@ -117,9 +117,11 @@ def export_int8(
         c_file: the C99 program of the core; None to write none.
 
     Raises:
-        ModelError: `quantize` did not make the network, or sums in C would exceed int32.
+        ModelError: `quantize` did not make the network, it is damaged, or sums in C would exceed
+            int32.
         OptionError: the tile does not suit the network, or a C file or an NPU needs one.
     """
+    require_undamaged(model, "the network")
     core = read_core(model)
     side_px = tile or fixed_tile_px(model)
     require_tile(side_px, core.host_part.place_px)

@@ -47,14 +47,18 @@ VALUE_BYTES: dict[int, int] = {
 def check_content(model: onnx.ModelProto, where: str) -> None:
     """Raise ModelError if a model does not hold what it states.
 
-    It checks that there are an input and an output, that no stated size is absurd, and that each
-    weight has as many finite values as its size states.
+    It checks that names are text, that there are an input and an output, that no stated size is
+    absurd, and that each weight has as many finite values as its size states.
 
     Args:
         model: the parsed file, not checked before.
         where: name of the network for the message, such as "a.onnx" or "the float network".
     """
     graph = model.graph
+    # protobuf returns bytes that are no UTF-8 as they are.
+    nodes = (field for node in graph.node for field in (node.op_type, node.domain, node.name))
+    if not all(isinstance(name, str) for name in nodes):
+        raise ModelError(f"{where} has a name that is no text. Copy or export it again.")
     initializers = {tensor.name for tensor in graph.initializer}
     if all(value.name in initializers for value in graph.input) or not graph.output:
         raise ModelError(

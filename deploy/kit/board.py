@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.conditioned_file import conditioned_on
+from beers_deploy.conditioned_file import to_run_on
 from beers_deploy.dpu.checker.table import check_network
 from beers_deploy.kit.golden import PICTURE, save_array, write_golden
 from beers_deploy.kit.host_facts import host_facts
@@ -21,7 +21,7 @@ from beers_deploy.network_files import other_sensor
 from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.shipped import BLIND, TILE_PX
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.quant.encodings import require_undamaged, save_config
+from beers_deploy.quant.encodings import save_config
 from beers_deploy.quant.session import open_session, tensors_of
 from beers_deploy.tables.markdown import markdown_text
 
@@ -90,8 +90,7 @@ class Board(TargetProfile):
         """
         profile = None if sensor is None else Sensor.load(sensor)
         images_of = profile or Sensor.load(BLIND)
-        network = conditioned_on(Network.load(int8, sensor=images_of), images_of)
-        require_undamaged(network.model, network.label)
+        network = to_run_on(Network.load(int8, sensor=images_of), images_of)
         folder = Path(out)
         warning = other_sensor(network.model, images_of)
         if warning:
@@ -102,6 +101,9 @@ class Board(TargetProfile):
         core = network.core(self, tile)
         exposed = {} if profile is None else network.exposures
         facts = host_facts(network, tile, profile, exposed)
+        # What an earlier kit in this folder knew of its cores would be wrong of these.
+        for older in (*folder.glob("core-x*.onnx"), folder / "known.json"):
+            older.unlink(missing_ok=True)
         core.save(folder / "core.onnx")
         for factor, other in exposed.items():
             other.core(self, tile).save(folder / f"core-x{factor:g}.onnx")

@@ -27,7 +27,7 @@ from beers_deploy.profiles.shipped import DEFAULT_TARGET
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.profiles.toml import read_json, unreadable
 from beers_deploy.quant.core import IntCore
-from beers_deploy.quant.encodings import read_core
+from beers_deploy.quant.encodings import read_core, require_undamaged
 from beers_deploy.quant.graph import PLANES
 from beers_deploy.quant.input_range import from_shares
 from beers_deploy.quant.integer.reference import run_core
@@ -69,6 +69,8 @@ def write_golden(
         OptionError: the network does not accept images of this size.
     """
     network = Network.load(int8, int8=True)
+    # A board that computes the right numbers would be called wrong.
+    require_undamaged(network.model, network.label)
     folder = Path(out)
     with faults_named(network.label):
         core = read_core(network.model)

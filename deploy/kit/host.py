@@ -8,13 +8,12 @@ factors. The script needs NumPy, host.json and onnxruntime; a board needs other 
 
 1. Each tile goes to one core or several (`factors`, `exposed`): core.onnx restores the tile as it
    is. Where host.json has exposures, core-x4.onnx restores dark pixels, multiplied by 4, and so on.
-2. Around a core (`restored`), the host encodes the tile as int8 planes, decodes the core's result
-   and adds it to the tile.
+2. Around a core, the host encodes the tile as int8 planes, and adds the result to it (`restored`).
 3. After the last tile, the consistency step (`consistent`) makes the restored image agree with the
    raw one at low spatial frequencies, if host.json has its weights.
 4. Then the self-check (`judged`) blurs the result as the sensor blurs and compares it with the raw
    image, block by block. restored-check.npy holds its two figures of each block.
-5. Each core restores a drawn tile (`known_tile`), whose checksum is compared with known.json.
+5. Each core restores a drawn tile (`known_tile`), to be compared with known.json (`--learn`).
 """
 
 from __future__ import annotations
@@ -316,20 +315,22 @@ def interpolated(blocks: np.ndarray, shape: tuple[int, ...], side: int = BLOCK) 
     return blocks
 
 
-def known_tile(runs: dict[float, Any], channels: int, learn: bool) -> str:
+def known_tile(runs: dict[float, Any], channels: int, learn: bool) -> None:
     """Restore a drawn tile by each core: another checksum than in known.json shows a flip."""
     path = HERE / "known.json"
     if not learn and not path.exists():
-        return "known tile: not learnt\n"
-    side = S["tile_px"]
-    tile = np.random.default_rng(0).random((1, channels, side, side), F)
+        return
+    size = (1, channels, S["tile_px"], S["tile_px"])
+    shares = np.random.default_rng(0).uniform(S["lowest_dn"] / 4095, 1, size)
+    tile = (shares / np.array(S["input_factors"])[:, None, None]).astype(F)
     crcs = {f"{f:g}": zlib.crc32(exposed(f, tile, run).tobytes()) for f, run in runs.items()}
     if learn:
         path.write_text(json.dumps(crcs), encoding="utf-8")
     learnt = json.loads(path.read_text(encoding="utf-8"))
     wrong = ", ".join(f"x{factor}" for factor, crc in crcs.items() if learnt.get(factor) != crc)
-    how = f"otherwise by {wrong}, whose weights must be loaded again" if wrong else "as learnt"
-    return f"known tile: restored {how}\n"
+    if wrong:
+        sys.exit(f"known tile: restored otherwise by {wrong}, whose weights must be loaded again")
+    sys.stdout.write("known tile: restored as learnt\n")
 
 
 def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
@@ -369,10 +370,9 @@ def main(source: str, target: str, runs: dict[float, Any], learn: bool) -> None:
     np.save(target, out)
     if S["self_check"]:
         blocks = np.stack([judged(raw, x) for raw, x in zip(image, out)])  # noqa: B905 - as above
-        path = Path(target)
-        np.save(path.with_name(f"{path.stem}-check.npy"), blocks)
+        np.save(Path(target).with_name(f"{Path(target).stem}-check.npy"), blocks)
         sys.stdout.write(report(blocks))
-    sys.stdout.write(known_tile(runs, len(image), learn))
+    known_tile(runs, len(image), learn)
 
 
 def cores() -> dict[float, Any]:

@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from beers_deploy.conditioned_file import conditioned_on
+from beers_deploy.conditioned_file import to_run_on
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.network_files import other_sensor
@@ -80,7 +80,7 @@ def networks_of(
             different bit depths and no full scale.
     """
     networks = {
-        band: conditioned_on(Network.load(network, sensor=sensor), sensor)
+        band: to_run_on(Network.load(network, sensor=sensor), sensor)
         for band, sensor in sensors.items()
     }
     first = next(iter(networks.values()))

@@ -20,7 +20,6 @@ import onnx
 from beers_deploy.model.raster.source import Source
 from beers_deploy.network import Network
 from beers_deploy.profiles.figures import Figure, measured, unavailable
-from beers_deploy.quant.encodings import require_undamaged
 from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.cluster import Cluster
 from beers_deploy.restoration.detectors.look import warn_of_detectors
@@ -230,8 +229,6 @@ class NetworkPipeline:
         raster = source.raster
         networks = in_order(self.networks, raster)
         require_alike(networks)
-        for network in networks:
-            require_undamaged(network.model, network.label)
         plan = plan_for(networks[0], raster.shape, self.tiles)
         logger.info(plan.sentence)
         check_memory(rows_bytes(source, plan), reading.memory_bytes)

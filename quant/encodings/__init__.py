@@ -15,7 +15,11 @@ from beers_deploy.quant.encodings.board import (
     save_config,
     vint8_model,
 )
-from beers_deploy.quant.encodings.checksum import CHECKSUM, require_undamaged
+from beers_deploy.quant.encodings.checksum import (
+    CHECKSUM,
+    require_undamaged,
+    with_damage_of,
+)
 from beers_deploy.quant.encodings.description import BORDER_PX, PLACE_PX, SENSOR_BIASES
 from beers_deploy.quant.encodings.description import KEY as CORE
 from beers_deploy.quant.encodings.explicit import implicit_parts
@@ -39,4 +43,5 @@ __all__ = [
     "required_tile",
     "save_config",
     "vint8_model",
+    "with_damage_of",
 ]

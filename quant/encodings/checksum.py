@@ -3,8 +3,8 @@
 A flipped bit in a weight may cost 1 dB of quality, which the noise of an image hides from the
 self-check of a restored image. The checksum finds every one.
 
-It covers the constants and the two entries of the metadata from which integers are computed. Others
-may be added to a file, such as the calibration of an interval.
+It covers nodes, constants, and the two entries of the metadata from which integers are computed.
+Others may be added to a file, such as the calibration of an interval.
 """
 
 import hashlib
@@ -30,11 +30,28 @@ def checksum(model: onnx.ModelProto) -> str:
     about = metadata(model)
     for key in (KEY, SENSOR_BIASES):
         digest.update(f"{key} {about.get(key, '')}\n".encode())
+    for node in model.graph.node:
+        digest.update(node.SerializeToString(deterministic=True))
     for tensor in model.graph.initializer:
         values = numpy_helper.to_array(tensor)
         digest.update(f"{tensor.name} {values.dtype.str} {values.shape}\n".encode())
         digest.update(values.tobytes())
     return digest.hexdigest()
+
+
+def with_damage_of(source: onnx.ModelProto, model: onnx.ModelProto) -> onnx.ModelProto:
+    """Return a model that was computed from an INT8 file, damaged if that file is.
+
+    Otherwise its new checksum would cover the damage.
+
+    Args:
+        source: the content of the file.
+        model: what was computed from it, with a checksum of its own.
+    """
+    if is_damaged(source):
+        about = {**metadata(model), CHECKSUM: metadata(source)[CHECKSUM]}
+        onnx.helper.set_model_props(model, about)
+    return model
 
 
 def is_damaged(model: onnx.ModelProto) -> bool:

@@ -14,7 +14,7 @@ from typing import Final
 import onnx
 import torch
 
-from beers_deploy.conditioned_file import conditioned_on
+from beers_deploy.conditioned_file import to_run_on
 from beers_deploy.model.shipped import INT8, shipped_names
 from beers_deploy.model.traditional.baselines import BASELINES
 from beers_deploy.model.traditional.patch_groups import QUALITIES
@@ -140,7 +140,7 @@ def method_named(name: str, degraded: Sensor, reference: Sensor, around: Around 
             f"{printable(repr(name))} in `methods` is not a method. Give {METHOD_NAMES}."
         )
     sensor = Sensor.load(other) if other else degraded
-    loaded = conditioned_on(Network.load(network, sensor=sensor), sensor)
+    loaded = to_run_on(Network.load(network, sensor=sensor), sensor)
     weights = loaded.weights
     method = method_of(name, loaded, sensor, reference, around, degraded.name)
     if weights is None:

@@ -14,7 +14,7 @@ from typing import cast
 import numpy as np
 from PIL import Image
 
-from beers_deploy.conditioned_file import conditioned_on
+from beers_deploy.conditioned_file import to_run_on
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.pictures import (
     busiest_windows,
@@ -241,7 +241,7 @@ def _method(
     if callable(source) and not isinstance(source, Network) and not hasattr(source, "state_dict"):
         return Method(name, source, "what the function knows")
     network = Network.load(cast("NetworkLike", source), sensor=sensors[0])
-    network = conditioned_on(network, sensors[0])
+    network = to_run_on(network, sensors[0])
     return method_of(name, network, *sensors, around)
 
 

@@ -171,8 +171,8 @@ def open_subject(
         sensor: the sensor that shipped networks are conditioned on.
 
     Raises:
-        ModelError: a network cannot be tiled, reads other values than [0, 1], or the float and the
-            INT8 network are swapped.
+        ModelError: a network cannot be tiled, has several bands, changes the size or reads other
+            values than [0, 1], or the float and the INT8 network are swapped.
     """
     profile = Sensor.load(sensor)
     if int8_network is not None or _is_pair(float_network):
@@ -187,7 +187,12 @@ def open_subject(
         subject = Subject(Runner(floating))
     for network in subject.by_name.values():
         # A network that cannot be tiled is refused before anything runs.
-        _ = network.tiling
+        tiling = network.tiling
+        if (tiling.channels_in, tiling.channels_out, tiling.scale) != (1, 1, 1):
+            raise ModelError(
+                f"{network.source.label} is a network {tiling.words}, but stress tests are for "
+                "networks that make one band of one band, in the same size."
+            )
         if network.source.input_ranges:
             raise ModelError(
                 f"{network.source.label} reads images of {in_words(network.source.input_ranges)}, "

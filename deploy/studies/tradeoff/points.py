@@ -14,7 +14,7 @@ from functools import cache
 from itertools import chain, product
 from pathlib import Path
 
-from beers_deploy.conditioned_file import conditioned_on
+from beers_deploy.conditioned_file import to_run_on
 from beers_deploy.dpu.board import Dpu, dpu_of
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import dpu_power, predict
@@ -145,7 +145,7 @@ def _variants(
             f"`network` must be a shipped network ({', '.join(shipped_names())}), or an ONNX or "
             f"safetensors file, but it is {printable(repr(source))}."
         )
-    network = conditioned_on(Network.load(source, sensor=sensor), sensor)
+    network = to_run_on(Network.load(source, sensor=sensor), sensor)
     tiling = network.tiling
     plain = replace(tiling, alignment_px=1, min_side_px=1, fixed_px=None) == Tiling(tiling.halo_px)
     if tiling.fixed_px is not None or not plain or HALO_STEP_PX % tiling.alignment_px:
