@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 Each = TypeVar("Each")
 
 
-def sensors_of(sensor: SensorLike | Mapping[str, Sensor]) -> dict[str, Sensor]:
+def sensors_of(sensor: SensorLike | Mapping[str, SensorLike]) -> dict[str, Sensor]:
     """Load the sensors that a user names for an image.
 
     Args:
@@ -38,7 +38,7 @@ def sensors_of(sensor: SensorLike | Mapping[str, Sensor]) -> dict[str, Sensor]:
         BeersError: a profile cannot be loaded.
     """
     if isinstance(sensor, Mapping):
-        return dict(sensor)
+        return {band: Sensor.load(profile) for band, profile in sensor.items()}
     # The path of one profile may have an equals sign in it.
     if not isinstance(sensor, str) or "=" not in sensor or Path(sensor).is_file():
         return {"": Sensor.load(sensor)}

@@ -136,7 +136,7 @@ def restore_file(
             interval = _write_interval(widths, output, work, checkpoint, bands)
             about = what_was_done(work.networks, work.scale)
             write_output(checkpoint, work.source, output, about)
-            listed = found_list_path(out, reading.fix_detectors) if faults.faults else None
+            listed = found_list_path(out, reading.fix_detectors)
             if listed is not None:
                 write_text(listed, faults.text)
             if output.self_check is not None:

@@ -52,7 +52,7 @@ def characterize(
 
     Raises:
         ImageError: images that are not raw, or that lack what is needed.
-        OptionError: an option that contradicts the pixels.
+        OptionError: an option that contradicts the pixels, or `out` is no .toml file.
 
     Examples:
         >>> raw = bd.simulate(size=256, seed=1).degraded
@@ -64,6 +64,8 @@ def characterize(
     from beers_deploy.studies.characterize import Stated, measured_sensor
 
     file = path_or_none(out)
+    if file is not None and file.suffix != ".toml":
+        raise OptionError(f"`out` must end in .toml, as sensor profiles do, got {file}.")
     edges = [edge] if isinstance(edge, str) else list(edge)
     stated = Stated(bits, gain, gsd, black_level, None if mtf is None else contrasts(mtf))
     sensor, toml = measured_sensor(images, edges, stated)

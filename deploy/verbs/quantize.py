@@ -149,20 +149,20 @@ def quantize(
     scenes = path_or_none(images)
     data = Data(Sensor.load(sensor), samples, scenes, patches, seed, patch, input_range)
     result, held_out = quantized(network, data, board, finetune, Effort(effort), adapt, output)
-    # Both are made before the first is written: a core that is refused leaves no file.
+    # All is made and judged before the first file is written: what is refused leaves none.
     core = result.core(board, tile) if files[1] else None
-    if files[0] is not None:
-        result.save(files[0])
-        count = len(read_core(result.model).ops)
-        logger.info("wrote %s: %d integer operations", files[0], count)
-    if core is not None and files[1] is not None:
-        save_core(core, files[1], board)
     notes = _notes(result, adapt)
     rows = list(result.layers)
     if held_out is not None:
         more, sentence = _judged(result, held_out, pages)
         rows = [*more, *rows]
         notes.append(sentence)
+    if files[0] is not None:
+        result.save(files[0])
+        count = len(read_core(result.model).ops)
+        logger.info("wrote %s: %d integer operations", files[0], count)
+    if core is not None and files[1] is not None:
+        save_core(core, files[1], board)
     assert result.origin is not None  # noqa: S101
     table = Table(
         command="quantize",

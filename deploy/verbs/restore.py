@@ -236,7 +236,7 @@ def _output(
     Args:
         out: the TIFF.
         documents: the STAC item and the view.
-        may_exist: whether the TIFF may exist.
+        may_exist: whether these files may exist.
         fix_detectors: what was asked about faulty detectors.
         how: the other fields of `Output`.
     """
@@ -251,11 +251,6 @@ def _output(
         )
     path = Path(out)
     widths = None if how["interval"] is None else interval_beside(path)
-    for each in (path, widths):
-        if each is not None and each.exists() and not may_exist:
-            raise OptionError(
-                f"{each} exists already. Add `overwrite` to replace it, or choose another name."
-            )
     named = [path_or_none(document) for document in documents]
     if named[0] is not None:
         optional("pystac", "stac")
@@ -263,7 +258,13 @@ def _output(
         named += [item, item.with_suffix(".onnx")]
     # The list of faults is an output of its own where they are searched for.
     listed = found_list_path(path, fix_detectors)
-    return Output(path, others=(*named, listed, how["self_check"], widths), **how)
+    others = (*named, listed, how["self_check"], widths)
+    for each in (path, *others):
+        if each is not None and each.exists() and not may_exist:
+            raise OptionError(
+                f"{each} exists already. Add `overwrite` to replace it, or choose another name."
+            )
+    return Output(path, others=others, **how)
 
 
 def _write_documents(

@@ -35,6 +35,9 @@ from beers_deploy.profiles.errors import (
 )
 from beers_deploy.profiles.toml import unreadable
 
+HFA = b"EHFA_HEADER_TAG"
+"""The first bytes of a file of ERDAS Imagine (HFA)."""
+
 DRIVERS = {
     **dict.fromkeys((".tif", ".tiff", ".btf", ".tf8"), "GTiff"),
     ".png": "PNG",
@@ -135,8 +138,11 @@ def _driver(path: Path) -> str:
             f"{path} must be an image with a suffix of {', '.join(DRIVERS)}, got "
             f"{suffix or 'none'}. Rename it, or convert it with 'gdal_translate'."
         )
-    has_header = path.with_suffix(".hdr").is_file()
-    return "ENVI" if suffix == ".img" and has_header else DRIVERS[suffix]
+    if suffix == ".img" and path.with_suffix(".hdr").is_file():
+        # The header may belong to another file of that stem.
+        with path.open("rb") as stream:
+            return DRIVERS[suffix] if stream.read(len(HFA)) == HFA else "ENVI"
+    return DRIVERS[suffix]
 
 
 def _require_sidecars(path: Path) -> None:

@@ -13,6 +13,7 @@ from importlib.metadata import version
 import onnx
 from onnx import helper, shape_inference
 
+from beers_deploy.profiles.errors import OptionError, reason_of
 from beers_deploy.quant.domains import opset_of
 
 WINDOW_DEFAULTS = {
@@ -43,6 +44,10 @@ def made_explicit(model: onnx.ModelProto, texts: dict[str, str]) -> onnx.ModelPr
 
     Returns:
         A model with the shape of every tensor that ONNX can infer.
+
+    Raises:
+        OptionError: the shapes contradict each other, as in a tile of another size than that for
+            which the network was exported.
     """
     opset = opset_of(model)
     for node in model.graph.node:
@@ -50,7 +55,13 @@ def made_explicit(model: onnx.ModelProto, texts: dict[str, str]) -> onnx.ModelPr
     for part in (model.graph, *model.graph.input, *model.graph.output):
         part.doc_string = texts[part.name]
     model.producer_version = version("beers-deploy")
-    return shape_inference.infer_shapes(model, strict_mode=True)
+    try:
+        return shape_inference.infer_shapes(model, strict_mode=True)
+    except shape_inference.InferenceError as error:
+        raise OptionError(
+            f"The network does not fit this `tile`: {reason_of(error)}. Leave it out, or give the "
+            "size that the network was exported for."
+        ) from error
 
 
 def implicit_parts(model: onnx.ModelProto) -> dict[str, list[str]]:

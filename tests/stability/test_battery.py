@@ -10,7 +10,7 @@ import onnx
 import pytest
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.onnx_file import save_onnx
+from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model, save_onnx
 from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.tiles.rows import restore_floats
@@ -117,6 +117,19 @@ def test_a_broken_int8_network_fails(pair: list[Path], tmp_path: Path) -> None:
     save_onnx(corrupted, tmp_path / "broken.onnx")
     results = look(open_subject(pair[0], tmp_path / "broken.onnx"), ["deciles"], ("INT8",))
     assert {"mean moved"} <= {measure.check for measure in results[0].failed}
+
+
+@pytest.mark.parametrize(("bands", "block"), [(3, 1), (1, 2)])
+def test_networks_of_several_bands_or_another_size_are_refused(
+    bands: int, block: int, tmp_path: Path
+) -> None:
+    writer = GraphWriter()
+    weight = writer.constant("w", np.ones((bands * block**2, bands, 1, 1), np.float32))
+    writer.node("Conv", "x", ["image", weight], "conv")
+    writer.node("DepthToSpace", "restored", ["x"], "shuffle", blocksize=block)
+    ends = ([image_info(name, bands, None)] for name in ("image", "restored"))
+    save_onnx(make_model(writer.graph("g", *ends), {}), tmp_path / "a.onnx")
+    assert "make one band of one band, in the same size" in refused("stress", tmp_path / "a.onnx")
 
 
 def test_a_halo_one_pixel_short_fails(subject: Subject) -> None:

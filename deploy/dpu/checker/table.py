@@ -145,10 +145,12 @@ ACCEPTED = "networks that 'quantize' refuses"
 
 
 def _makes_image(network: SizedGraph) -> bool:
-    """Return True if a network maps one image to one image, as 'quantize' requires."""
+    """Return True if a network maps one image to one image, as 'quantize' requires. A result of
+    unknown shape may be one.
+    """
     results = [op.out_shape for op in network.operations if op.output in network.outputs]
-    sides_px = [min(shape[1:]) for shape in results if shape is not None]
-    return len(network.inputs) == 1 and len(network.outputs) == 1 and max(sides_px, default=0) > 1
+    is_image = all(shape is None or min(shape[1:]) > 1 for shape in results)
+    return len(network.inputs) == 1 and len(network.outputs) == 1 and bool(results) and is_image
 
 
 def _rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:

@@ -20,7 +20,8 @@ from beers_deploy.profiles.toml import unreadable
 FOUND = "found"
 HEADER = ("column", "row", "band")
 ALL = "*"
-NO_FAULT = re.compile(r"\s*|#.*|\s*column\s*,\s*row\s*(,\s*band\s*)?")
+HEADER_LINE = re.compile(r"\s*column\s*,\s*row\s*(,\s*band\s*)?")
+NO_FAULT = re.compile(rf"\s*|#.*|{HEADER_LINE.pattern}")
 """Lines of a list that are skipped: empty ones, comments and the header."""
 FAULT = re.compile(
     r"(?!\s*\*\s*,\s*\*)\s*(\d{1,9}|\*)\s*,\s*(\d{1,9}|\*)\s*(?:,\s*0*([1-9]\d{0,8})\s*)?",
@@ -137,8 +138,8 @@ def read_list(path: Path, raster: Raster) -> FaultList:
         raster: the description of the image.
 
     Raises:
-        OptionError: the file cannot be read or lists no fault, or a line is no fault or lies
-            outside the image.
+        OptionError: the file cannot be read or has neither faults nor a header, or a line is no
+            fault or lies outside the image.
     """
     reason = "lists none"
     lines = list[str]()
@@ -151,7 +152,8 @@ def read_list(path: Path, raster: Raster) -> FaultList:
         for number, line in enumerate(lines, 1)
         if not NO_FAULT.fullmatch(line)
     ]
-    if not faults:
+    # A list that a run found empty has its header alone.
+    if not faults and not any(HEADER_LINE.fullmatch(line) for line in lines):
         raise OptionError(
             f"`fix_detectors` must be '{FOUND}' or a list of faulty detectors, but {path} {reason}."
             " Write lines 'column,row', counted from 0, with '*' as the row for a whole column."

@@ -193,6 +193,11 @@ def _settled_bits(stated: int | None, largest: int, step: int, piled: bool) -> i
             f"`bits` allows digital numbers up to {2**bits - 1}, but the images have {largest_dn}. "
             "Give the bits of the raw image."
         )
+    if (2**bits - 1) * step > MAX_DN:
+        raise OptionError(
+            f"`bits` of {stated} and values that are multiples of {step} make a full scale of "
+            f"{(2**bits - 1) * step}, but 16 bits hold up to {MAX_DN}. Give fewer bits."
+        )
     return bits
 
 

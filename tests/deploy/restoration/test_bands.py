@@ -54,6 +54,8 @@ def test_bands_without_names_are_used_in_order(tmp_path: Path) -> None:
     for band, sensor in ((0, SECOND), (1, FIRST)):
         assert_array_equal(result[band], restored(tmp_path / "in.tif", sensor)[0][band])
     assert_array_equal(restored(tmp_path / "in.tif", f"B1={FIRST},B0={SECOND}")[0], result)
+    by_name = sensors_of({"B1": FIRST, "B0": Sensor.load(SECOND)})
+    assert by_name == sensors_of(f"B1={FIRST},B0={SECOND}")
 
 
 @pytest.mark.parametrize(

@@ -167,7 +167,7 @@ def test_a_list_is_read_as_it_was_written(
     [
         (None, "list of faulty detectors"),
         ("\udcff", "list of faulty detectors"),
-        ("column,row\n", "lists none"),
+        ("# nothing\n", "lists none"),
         ("column,row\n1,8", "list.csv (1,8) lies outside"),
         ("1,2,4", "3 bands"),
         *((line, "must be column,row") for line in ("1,2,0", "*,*", "1", "1,2,3,4", "-1,2", "a,b")),
@@ -245,6 +245,12 @@ def test_a_restoration_sees_the_replaced_pixels(image: Path, model: Path, tmp_pa
     restore(image, tmp_path / "again.tif", fix_detectors=str(listed), **options)
     assert_array_equal(tifffile.imread(tmp_path / "again.tif"), expected)
     assert not (tmp_path / "again.detectors.csv").exists()
+    # In what is fixed no fault is left, and the list says so in place of the older one.
+    options["overwrite"] = True
+    restore(tmp_path / "fixed.tif", tmp_path / "out.tif", fix_detectors="found", **options)
+    assert listed.read_text() == "column,row\n"
+    restore(tmp_path / "fixed.tif", tmp_path / "out.tif", fix_detectors=str(listed), **options)
+    assert_array_equal(tifffile.imread(tmp_path / "out.tif"), expected)
     shown = done(f"restore {image} --dry-run --network {model}")
     assert "look at the detectors: 1 dead column" in shown
     assert "dead lines" in shown

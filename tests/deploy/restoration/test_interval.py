@@ -181,12 +181,15 @@ def test_a_network_without_a_sound_interval_is_refused(
     assert [file.name for file in tmp_path.iterdir()] == ["mine.onnx"]
 
 
-def test_an_older_file_of_half_widths_is_not_replaced(image: Path, tmp_path: Path) -> None:
-    older = tmp_path / "out-interval.tif"
+@pytest.mark.parametrize("name", ["out-interval.tif", "blocks.tif", "page.html"])
+def test_an_older_file_is_not_replaced(name: str, image: Path, tmp_path: Path) -> None:
+    older = tmp_path / name
     older.write_bytes(b"older")
-    with pytest.raises(OptionError, match=r"out-interval\.tif exists already"):
-        restore(image, tmp_path / "out.tif", **OPTIONS)
+    beside = {"self_check": tmp_path / "blocks.tif", "view": tmp_path / "page.html"}
+    with pytest.raises(OptionError, match=f"{name} exists already"):
+        restore(image, tmp_path / "out.tif", **beside, **OPTIONS)
     assert older.read_bytes() == b"older"
+    assert [*tmp_path.iterdir()] == [older]
 
 
 @pytest.mark.parametrize("name", shipped_names())

@@ -157,6 +157,14 @@ def test_envi_is_known_by_its_header(tmp_path: Path) -> None:
             np.testing.assert_array_equal(source.read(3, 9), pixels[:, 3:9])
 
 
+def test_the_header_of_another_file_makes_no_envi_of_an_erdas_image(tmp_path: Path) -> None:
+    pixels = formats.digital_numbers()
+    formats.write(tmp_path / "a.bsq", pixels + 1, "ENVI")
+    formats.write(tmp_path / "a.img", pixels, "HFA")
+    with open_raster(tmp_path / "a.img") as source:
+        np.testing.assert_array_equal(source.read(3, 9), pixels[:, 3:9])
+
+
 def test_a_name_without_a_known_suffix_is_refused(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "a.dat2", pixels_of("uint16"))
     refused(tmp_path / "a.dat2", ImageError, r"suffix of \.tif.*got \.dat2")

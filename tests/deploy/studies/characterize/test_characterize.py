@@ -223,6 +223,7 @@ WRONG: dict[str, tuple[np.ndarray, str, str]] = {
     "three contrasts": (RAW, "--bits 12 --mtf 0.1,0.1,0.1", "one or two ratios"),
     "open bits": (RAW, "", "--bits is missing"),
     "wrong bits": (RAW, "--bits 8", "up to 255"),
+    "bits and steps": (RAW // 4 * 64, "--bits 12", "a full scale of 262080, but 16 bits"),
     "gain": (RAW, "--bits 12 --gain 0", "above 0"),
     "no noise": (np.full_like(RAW, 1000), "--bits 12", "noise"),
     "nodata": (np.zeros_like(RAW), "--bits 12", "unclipped"),
@@ -237,6 +238,13 @@ def test_wrong_input_is_one_sentence(case: str, tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["raw.tif"]
     assert words in message
     assert message.startswith("beers-deploy: ")
+
+
+def test_a_profile_that_no_command_reads_is_not_written(tmp_path: Path) -> None:
+    image = tiff(tmp_path, RAW)
+    message = refused("characterize", image, "--bits", 12, "--out", tmp_path / "mine.txt")
+    assert "must end in .toml" in message
+    assert [*tmp_path.iterdir()] == [image]
 
 
 def test_one_image_twice_is_refused(raw: tuple[Path, Path], tmp_path: Path) -> None:
