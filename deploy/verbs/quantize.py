@@ -30,6 +30,7 @@ from beers_deploy.verbs.verb import path_or_none, recorded, refuse_with, refuse_
 if TYPE_CHECKING:
     from beers_deploy.network import Network
     from beers_deploy.profiles.figures import Row
+    from beers_deploy.profiles.target import TargetProfile
     from beers_deploy.quant.samples.patches import Patches
 
 logger = logging.getLogger(__name__)
@@ -151,6 +152,7 @@ def quantize(
     result, held_out = quantized(network, data, board, finetune, Effort(effort), adapt, output)
     # All is made and judged before the first file is written: what is refused leaves none.
     core = result.core(board, tile) if files[1] else None
+    _warn_of_refusals(result, board)
     notes = _notes(result, adapt)
     rows = list(result.layers)
     if held_out is not None:
@@ -237,6 +239,16 @@ def _notes(result: "Network", adapt: bool) -> list[str]:
     except ModelError as error:
         notes.append(f"`restore` does not run it, and `bench` counts whole images: {error}")
     return notes
+
+
+def _warn_of_refusals(result: "Network", board: "TargetProfile") -> None:
+    """Warn if the board does not run what was quantised, which other hardware may."""
+    from beers_deploy.dpu.checker.table import check_network
+
+    # For an NPU the file of the core is checked, which is fixed to a tile.
+    checked = None if board.npu else check_network(result, board, None, None)
+    if checked is not None and checked.failed:
+        logger.warning("%s does not run it: %s", board.name, checked.verdict)
 
 
 def _judged(network: "Network", held_out: "Patches", pages: list[Path]) -> "tuple[list[Row], str]":

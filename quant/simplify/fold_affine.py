@@ -80,6 +80,26 @@ def negate_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[
     return [negation, Node.new("Add", [node.inputs[0], name], node.outputs[0], node.proto.name)]
 
 
+def divide_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace a division by constants, which a DPU does not compute, by a convolution of one pixel.
+
+    Args:
+        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
+        graph: the graph that the node belongs to; its constants are extended.
+        node: any node.
+
+    Returns:
+        The convolution; None if the node is no Div of a map of known channels by numbers for each
+        channel, none of which is 0.
+    """
+    divisor = per_channel(graph.value(node, 1)) if node.op_type == "Div" else None
+    channels = 0 if divisor is None else channels_in(shapes, node.inputs[0])
+    if divisor is None or not channels or not divisor.all():
+        return None
+    weight = np.broadcast_to(1 / divisor, channels).reshape(channels, 1, 1, 1)
+    return [graph.convolution(node.inputs[0], node.outputs[0], node.name, weight, group=channels)]
+
+
 def fold_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Fold a node that scales and shifts channels into the convolution in front of it (point 2 of
     the module).

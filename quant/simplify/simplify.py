@@ -10,10 +10,10 @@ these properties:
    BatchNormalization of images is a depthwise 1 x 1 convolution. Zeros that Pad adds are the
    convolution's own.
 4. Sub of two maps is Add, Sum is Add, a mean over the image is GlobalAveragePool. HardSwish is one
-   operator, ReLU6 is Clip from 0 to 6, and a Clip at 0 alone is ReLU. Nothing splits or crops a
-   map: each part is computed separately. Padded kernels have at most 64 positions. Nothing is
-   computed from the size of the image, unless the size has an effect. The channels of the image
-   come first.
+   operator, ReLU6 is Clip from 0 to 6, and a Clip at 0 alone is ReLU. Activations precede what only
+   moves values. Nothing splits or crops a map: each part is computed separately. Padded kernels
+   have at most 64 positions. Nothing is computed from the size of the image, unless the size has an
+   effect. The channels of the image come first.
 5. Operators are those of opset 17, unless one has no form there.
 6. The result of a network without padding has the image's size, or a multiple of it: the image is
    mirrored beyond its borders.
@@ -45,11 +45,13 @@ from onnx.shape_inference import InferenceError
 from beers_deploy.profiles.errors import ModelError, reason_of
 from beers_deploy.quant.domains import IR_VERSION, OPSET, opset_of
 from beers_deploy.quant.onnx.graph import OnnxGraph, free_name
+from beers_deploy.quant.simplify.activations_first import activations_first
 from beers_deploy.quant.simplify.channels_first import channels_first
 from beers_deploy.quant.simplify.crop_borders import convolve_crop
 from beers_deploy.quant.simplify.fold_affine import (
     add_negated,
     convolve_normalisation,
+    divide_by_convolution,
     fold_behind,
     fold_in_front,
     negate_by_convolution,
@@ -114,7 +116,7 @@ def simplify(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     """
     with contradictions(where):
         network = model if _is_plain(model) else _simplified(model, where)
-        return with_missing_border(network)
+        return with_missing_border(activations_first(network))
 
 
 def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
@@ -161,6 +163,7 @@ def _run_passes(model: onnx.ModelProto) -> None:
         pool_mean,
         convolve_normalisation,
         negate_by_convolution,
+        divide_by_convolution,
         unshuffle_slices,
         split_channels,
         convolve_crop,

@@ -1,5 +1,6 @@
 """What check passes, quantize accepts, gate judges, bench predicts and restore runs."""
 
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -244,3 +245,22 @@ def test_quantize_says_what_restore_refuses(tmp_path: Path) -> None:
     assert any("`restore` does not run it" in note for note in int8.table.notes)
     with pytest.raises(ModelError, match="cannot be tiled"):
         bd.restore(samples[0, 0], network=int8, full_scale=1, progress=False, force=True, tile=32)
+
+
+def test_quantize_warns_of_what_the_board_refuses(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Other hardware may run it, so that it is written, but nobody finds out on the board."""
+    w = Drawn(1)
+    first, second = (w.conv("image", CHANNELS, 1) for _ in range(2))
+    last = w.conv(w.add("HardSwish", w.add("Add", first, second)), 1, CHANNELS)
+    result = helper.make_tensor_value_info(last, onnx.TensorProto.FLOAT, ["N", 1, None, None])
+    graph = w.graph("drawn", [image_info("image", 1, None)], [result])
+    onnx.save(make_model(graph, {}), tmp_path / "a.onnx")
+    samples = np.random.default_rng(1).uniform(0, 1, (4, 1, 32, 32)).astype(np.float32)
+    with one_guess(), caplog.at_level(logging.WARNING, "beers_deploy"):
+        int8 = bd.quantize(tmp_path / "a.onnx", samples=samples, progress=False)
+    (warning,) = (record.getMessage() for record in caplog.records)
+    assert warning.startswith("vck190 does not run it: check FAILED")
+    assert "HardSwish stands behind add" in warning
+    assert not bd.check(int8)

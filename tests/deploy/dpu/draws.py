@@ -104,5 +104,13 @@ def behind_sum(op_type: str, **attributes: Value) -> Draw:
     return in_two(doubled, node(op_type, **attributes))
 
 
+def mean_pool() -> Draw:
+    return node("AveragePool", kernel_shape=[2, 2])
+
+
+def behind_mean(op_type: str) -> Draw:
+    return in_two(mean_pool(), node(op_type))
+
+
 def behind_pool(op_type: str, **attributes: Value) -> Draw:
     return in_two(max_pool(2, 2), node(op_type, **attributes))

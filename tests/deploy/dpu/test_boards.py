@@ -28,6 +28,7 @@ from tests.deploy.dpu.draws import (
     Draw,
     behind_conv,
     behind_depthwise,
+    behind_mean,
     behind_pool,
     behind_sum,
     between_convs,
@@ -109,7 +110,9 @@ def compared(channels: int) -> Draw:
 @pytest.mark.parametrize(
     ("draw", "boards"),
     [
-        (behind_pool("Relu"), {"vek280"}),
+        (behind_mean("Relu"), {"vek280"}),
+        # In front of a maximum it gives the same.
+        (behind_pool("Relu"), set(DPUS)),
         (behind_sum("HardSwish"), {"vek280"}),
         (behind_depthwise("HardSwish"), set(DPUS)),
         (behind_conv("HardSigmoid"), set(DPUS)),

@@ -131,6 +131,10 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         f"m = Mul(x, image) c = {SAME}(m, w) y = Add(c, m)",
         {"Mul": 1, "Conv": 1, "Add": 1},
     ),
+    "divided, and read elsewhere": (
+        f"m = Div(x, image) c = {SAME}(m, w) y = Add(c, m)",
+        {"Conv": 2, "Add": 1},
+    ),
     "one channel times four constants": (
         f"c = {SAME}(x, one) m = Mul(c, image) y = {SAME}(m, w)",
         {"Conv": 2, "Mul": 1},
