@@ -56,8 +56,8 @@ def check_content(model: onnx.ModelProto, where: str) -> None:
     """
     graph = model.graph
     # protobuf returns bytes that are no UTF-8 as they are.
-    nodes = (field for node in graph.node for field in (node.op_type, node.domain, node.name))
-    if not all(isinstance(name, str) for name in nodes):
+    names = chain.from_iterable((node.op_type, node.domain, node.name) for node in graph.node)
+    if not all(isinstance(name, str) for name in names):
         raise ModelError(f"{where} has a name that is no text. Copy or export it again.")
     initializers = {tensor.name for tensor in graph.initializer}
     if all(value.name in initializers for value in graph.input) or not graph.output:
