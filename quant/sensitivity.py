@@ -319,7 +319,9 @@ def losses(
     """
     if math.isnan(gate.drop_db):
         mae = f"{gate.mae:.2g} of full scale on average"
-        return f"INT8 differs from float by {mae} ({gate.source})"
+        unfit = any(reference.size for _, reference in patches.pairs)
+        advice = "; no loss of PSNR, because references are not of the result's size"
+        return f"INT8 differs from float by {mae} ({gate.source}){advice if unfit else ''}"
     message = (
         f"INT8 loses {gate.drop_db:.2f} dB of {gate.psnr_float_db:.2f}, and "
         f"{gate.worst_drop_db:.2f} dB where most ({gate.source})"

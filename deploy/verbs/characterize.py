@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.verbs.parameters import Edges, Images, Interval, Mtf, Progress, RequiredFile
-from beers_deploy.verbs.verb import path_or_none, verb
+from beers_deploy.verbs.verb import path_or_none, refuse_with, verb
 
 if TYPE_CHECKING:
     from beers_deploy.studies.characterize import MeasuredSensor
@@ -67,6 +67,7 @@ def characterize(
     if file is not None and file.suffix != ".toml":
         raise OptionError(f"`out` must end in .toml, as sensor profiles do, got {file}.")
     edges = [edge] if isinstance(edge, str) else list(edge)
+    refuse_with("`mtf`", edge=mtf is not None and bool(edges))
     stated = Stated(bits, gain, gsd, black_level, None if mtf is None else contrasts(mtf))
     sensor, toml = measured_sensor(images, edges, stated)
     if file is not None:

@@ -1,5 +1,6 @@
 """Error attribution: each layer by itself, against the networks that it stands for."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.sensitivity import Loss, layer_errors, losses
 from beers_deploy.quant.session import few_crops, open_session, run
-from tests.quant.quick import patches_of, quickly
+from tests.quant.quick import patches_of, quickly, without_references
 
 SPOILT = "body.1.second"
 
@@ -80,6 +81,9 @@ def test_what_is_lost_is_told_and_of_much_also_where(
     worst = max(layers, key=lambda layer: layer.network.squared)
     assert f": most of it in {worst.name} (" in much
     assert much.endswith("; try `finetune` auto")
+    without = replace(gate, psnr_float_db=math.nan)
+    assert losses(spoilt, without, patches).endswith("references are not of the result's size")
+    assert losses(spoilt, without, without_references(patches)).endswith("patches of 128 x 128)")
     tuned = replace(spoilt, host=host_model(spoilt.core, {"finetune": "3 steps"}))
     drop = replace(gate, psnr_float_db=40.0, psnr_int8_db=39.6)
     assert losses(tuned, drop, patches).endswith(" %)")

@@ -220,6 +220,11 @@ WRONG: dict[str, tuple[np.ndarray, str, str]] = {
     "steps": (RAW * 16 + 3, "--bits 16", "Divide them by 16"),
     "black": (RAW, "--bits 12 --black-level 1500", "--black-level must be at least 0"),
     "mtf": (RAW, "--bits 12 --mtf 7", "Write 0.07 for 7 %"),
+    "mtf and edge": (
+        RAW,
+        "--bits 12 --mtf 0.07 --edge a.tif:1,1,30,30",
+        "--edge has no effect with",
+    ),
     "three contrasts": (RAW, "--bits 12 --mtf 0.1,0.1,0.1", "one or two ratios"),
     "open bits": (RAW, "", "--bits is missing"),
     "wrong bits": (RAW, "--bits 8", "up to 255"),
