@@ -21,6 +21,7 @@ from beers_deploy.quant.adapt.replacements import (
     APPROXIMATIONS,
     EXACT,
     Kind,
+    hard_swish_behind_convolutions,
     nodes_by_kind,
     replaced,
 )
@@ -149,7 +150,7 @@ def adapt(model: onnx.ModelProto, samples: Patches, held_out: Patches) -> Adapte
         rows.append(Row(ADAPTED, f"{count} {kind}", figures, {"becomes": becomes}))
     record = "; ".join(f"{row.name}: {row.text['becomes']}" for row in rows)
     rows.append(Row(ADAPTED, "all", chosen.figures))
-    return Adapted(chosen.model, tuple(rows), record)
+    return Adapted(hard_swish_behind_convolutions(chosen.model), tuple(rows), record)
 
 
 def _trial(

@@ -90,11 +90,14 @@ def divide_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[
 
     Returns:
         The convolution; None if the node is no Div of a map of known channels by numbers for each
-        channel, none of which is 0.
+        channel, none of which is 0, or is a part of a GELU or Swish.
     """
     divisor = per_channel(graph.value(node, 1)) if node.op_type == "Div" else None
     channels = 0 if divisor is None else channels_in(shapes, node.inputs[0])
     if divisor is None or not channels or not divisor.all():
+        return None
+    # A GELU or Swish is recognised by its parts.
+    if any(reader.op_type in ("Erf", "Sigmoid") for reader in graph.readers[node.outputs[0]]):
         return None
     weight = np.broadcast_to(1 / divisor, channels).reshape(channels, 1, 1, 1)
     return [graph.convolution(node.inputs[0], node.outputs[0], node.name, weight, group=channels)]

@@ -264,3 +264,24 @@ def test_quantize_warns_of_what_the_board_refuses(
     assert warning.startswith("vck190 does not run it: check FAILED")
     assert "HardSwish stands behind add" in warning
     assert not bd.check(int8)
+
+
+@pytest.mark.parametrize("kind", ["Add", "Mul", "Concat", "AveragePool"])
+def test_what_adapt_replaces_fits_behind_any_operation(kind: str, tmp_path: Path) -> None:
+    """`check` advises `--adapt`, so that its result must pass."""
+    w = Drawn(1)
+    feeds = [w.conv("image", CHANNELS, 1) for _ in range(2)]
+    attributes: dict[str, Any] = {"axis": 1} if kind == "Concat" else {}
+    if kind == "AveragePool":
+        feeds = feeds[:1]
+        attributes = {"kernel_shape": [3, 3], "pads": [1, 1, 1, 1], "count_include_pad": 1}
+    source = w.add(kind, *feeds, **attributes)
+    silu = w.add("Mul", source, w.add("Sigmoid", source))
+    last = w.conv(silu, 1, CHANNELS * (2 if kind == "Concat" else 1))
+    result = helper.make_tensor_value_info(last, onnx.TensorProto.FLOAT, ["N", 1, None, None])
+    graph = w.graph("drawn", [image_info("image", 1, None)], [result])
+    onnx.save(make_model(graph, {}), tmp_path / "a.onnx")
+    samples = np.random.default_rng(1).uniform(0, 1, (8, 1, 32, 32)).astype(np.float32)
+    with one_guess():
+        int8 = bd.quantize(tmp_path / "a.onnx", samples=samples, adapt=True, progress=False)
+    assert bd.check(int8)
