@@ -25,7 +25,7 @@ BOARD = "vck190"
 
 OPENING = f"""# Bit flips
 
-This page shows what bit flips by radiation cost {", ".join(VARIANTS[:-1])} and {VARIANTS[-1]}, and what guards gain:
+What bit flips by radiation cost three networks, and what guards gain:
 
     beers-deploy stress --bit-flips --draws {SOURCE.patches} --side {SOURCE.patch_px}
 
