@@ -134,7 +134,7 @@ def with_value(error: typer.BadParameter) -> str:
     Args:
         error: Typer's error, which pydantic caused in most cases.
     """
-    faults = getattr(error.__cause__, "errors", list)()
+    faults: list[Any] = getattr(error.__cause__, "errors", list)()
     if not faults:
         return error.message
     reason = faults[0]["msg"].removeprefix("Value error, ").partition(", unable to parse")[0]

@@ -188,7 +188,7 @@ def open_subject(
     for network in subject.by_name.values():
         # A network that cannot be tiled is refused before anything runs.
         tiling = network.tiling
-        if (tiling.channels_in, tiling.channels_out, tiling.scale) != (1, 1, 1):
+        if (tiling.channels_in, tiling.channels_out) != (1, 1) or tiling.scale != 1:
             raise ModelError(
                 f"{network.source.label} is a network {tiling.words}, but stress tests are for "
                 "networks that make one band of one band, in the same size."

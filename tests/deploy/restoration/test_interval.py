@@ -185,7 +185,10 @@ def test_a_network_without_a_sound_interval_is_refused(
 def test_an_older_file_is_not_replaced(name: str, image: Path, tmp_path: Path) -> None:
     older = tmp_path / name
     older.write_bytes(b"older")
-    beside = {"self_check": tmp_path / "blocks.tif", "view": tmp_path / "page.html"}
+    beside: dict[str, Any] = {
+        "self_check": tmp_path / "blocks.tif",
+        "view": tmp_path / "page.html",
+    }
     with pytest.raises(OptionError, match=f"{name} exists already"):
         restore(image, tmp_path / "out.tif", **beside, **OPTIONS)
     assert older.read_bytes() == b"older"

@@ -1,5 +1,7 @@
 """Activations move into convolutions, through whatever only moves values, and change no result."""
 
+from typing import Any
+
 import numpy as np
 import onnx
 import pytest
@@ -20,7 +22,7 @@ def moving(writer: GraphWriter, kind: str, source: str, beside: str) -> str:
     if kind == "DepthToSpace":
         return writer.node(kind, result, [source], result, blocksize=2)
     if kind in ("MaxPool", "AveragePool"):
-        window = {"kernel_shape": [3, 3], "pads": [1, 1, 1, 1], "strides": [2, 1]}
+        window: dict[str, Any] = {"kernel_shape": [3, 3], "pads": [1, 1, 1, 1], "strides": [2, 1]}
         return writer.node(kind, result, [source], result, **window)
     scales = writer.constant("scales", np.array([1, 1, 2, 2], np.float32))
     none = writer.constant("none", np.array([], np.float32))
@@ -46,7 +48,9 @@ def network(kinds: list[str], activation: str, read_twice: bool = False) -> onnx
     feeds = [last]
     if activation == "Clip":
         ends = {"zero": 0.0, "six": 6.0}
-        feeds += [writer.constant(name, np.float32(value)) for name, value in ends.items()]
+        feeds += [
+            writer.constant(name, np.array(value, np.float32)) for name, value in ends.items()
+        ]
     last = writer.node(activation, "active", feeds, "active")
     writer.node("Identity", "restored", [conv("c", last, (1, channels, 1, 1))], "end")
     results = ["restored", *([first] if read_twice else [])]
