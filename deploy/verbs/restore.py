@@ -169,7 +169,7 @@ def restore(
         how: dict[str, Any] = {"compression": compression, "cog": cog, "resume": resume}
         how["interval"] = interval
         how["self_check"] = path_or_none(self_check)
-        output = _output(out, (stac, view), overwrite, fix_detectors or "", **how)
+        output = _output(out, (stac, view), overwrite or resume, fix_detectors or "", **how)
     sensors = sensors_of(sensor)
     unknown = is_unknown(sensors)
     reading = Reading(
@@ -236,11 +236,10 @@ def _output(
     Args:
         out: the TIFF.
         documents: the STAC item and the view.
-        may_exist: whether these files may exist, as those of a run that is continued always may.
+        may_exist: whether these files may exist.
         fix_detectors: what was asked about faulty detectors.
         how: the other fields of `Output`.
     """
-    from beers_deploy.model.io.lock import part_folder
     from beers_deploy.restoration.detectors.fault_list import found_list_path
     from beers_deploy.restoration.interval import interval_beside
     from beers_deploy.restoration.output import Output
@@ -260,8 +259,6 @@ def _output(
     # The list of faults is an output of its own where they are searched for.
     listed = found_list_path(path, fix_detectors)
     others = (*named, listed, how["self_check"], widths)
-    # The run that is continued was allowed to replace them.
-    may_exist = may_exist or (how["resume"] and part_folder(path).is_dir())
     for each in (path, *others):
         if each is not None and each.exists() and not may_exist:
             raise OptionError(

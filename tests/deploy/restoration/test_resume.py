@@ -101,15 +101,6 @@ def test_finished_rows_are_not_restored_again(
     assert out.read_bytes() == expected
 
 
-def test_an_output_that_no_stopped_run_left_is_not_replaced(
-    image: Path, model: Path, tmp_path: Path
-) -> None:
-    (tmp_path / "out.tif").write_bytes(b"older")
-    with pytest.raises(OptionError, match=r"out\.tif exists already"):
-        restore(image, tmp_path / "out.tif", network=model, resume=True)
-    assert (tmp_path / "out.tif").read_bytes() == b"older"
-
-
 @pytest.mark.parametrize("calls", [0, 4, 1000])
 def test_a_full_disk_is_an_error_of_one_line_and_loses_no_finished_row(
     calls: int,
