@@ -80,7 +80,7 @@ def dual_range(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
 
 
 def offset_windows(coarse: np.ndarray, *windows: np.ndarray) -> np.ndarray:
-    """Merge a coarse copy with windows, copies in fine steps around offsets: the last that fits."""
+    """Merge a coarse copy with fine windows around offsets, of which the last that fits counts."""
     value = coarse * F(S["gain"])
     for window, offset in zip(windows, S["offsets"]):  # noqa: B905 - a board's Python may be old
         value = np.where(fits(window), window + np.array(offset, F)[:, None, None], value)
@@ -108,7 +108,7 @@ DECODINGS: dict[str, Any] = {
 def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
     """Restore a tile (1, C, h, w) by one core: encode it, decode the result, and add the tile.
 
-    `run` computes the core's result from planes, of which `unit` is the share of full scale of 1.
+    `run` computes the core's result from planes. A result of 1 is `unit` of full scale.
     """
     copies = np.split(run(encoded(image)), S["copies"], 1)
     value = shuffled(DECODINGS[S["decoding"]](*copies), S["back"], up=True) * F(unit)
@@ -304,7 +304,7 @@ def inner(count: int) -> tuple[int, int]:
 def interpolated(blocks: np.ndarray, shape: tuple[int, ...], side: int = BLOCK) -> np.ndarray:
     """Interpolate bilinearly between the centres of blocks of `side` pixels, to (H, W) = `shape`.
 
-    Blocks at the border, into which H brings light from outside, are left out for the nearest one.
+    Blocks at the border, into which H brings light from outside, count as the nearest one inside.
     """
     for size in shape:
         place = np.arange(size) - side // 2
@@ -316,7 +316,7 @@ def interpolated(blocks: np.ndarray, shape: tuple[int, ...], side: int = BLOCK) 
 
 
 def known_tile(runs: dict[float, Any], channels: int, learn: bool) -> None:
-    """Restore a drawn tile by each core: another checksum than in known.json shows a flip."""
+    """Restore a drawn tile by each core. Another checksum than in known.json shows a flip."""
     path = HERE / "known.json"
     if not learn and not path.exists():
         return
