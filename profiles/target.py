@@ -6,6 +6,7 @@ shipped board. So a board with a known DPU only needs to state its cores, clock 
 
 import os
 from collections.abc import Mapping
+from functools import cache
 from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, model_validator
@@ -14,7 +15,7 @@ from pydantic.dataclasses import dataclass
 from beers_deploy.profiles.constant import Constant, Words
 from beers_deploy.profiles.errors import OptionError, ProfileError, printable
 from beers_deploy.profiles.shipped import MODEL_SUFFIX, board_names, target_names
-from beers_deploy.profiles.target_limits import check_limits
+from beers_deploy.profiles.target_limits import ANY_KEY, check_limits
 from beers_deploy.profiles.toml import read_toml
 from beers_deploy.profiles.validation import CONFIG, check_keys, validated
 
@@ -171,7 +172,35 @@ def _read(name: str) -> TargetProfile:
     if profile.configurations:
         # This raises if the default is none of them.
         profile.configuration()
+    # Last, because a wrong type or number is the more precise message.
+    _check_names(label, profile)
     return profile
+
+
+def _check_names(label: str, profile: TargetProfile) -> None:
+    """Raise ProfileError if a table or a key is in no shipped target, because nothing reads it."""
+    keys = _shipped_keys()
+    check_keys(label, profile.tables, (), keys)
+    for name, table in profile.tables.items():
+        if name not in ANY_KEY:
+            check_keys(f"{label} [{name}]", table, (), keys[name])
+    for name, table in profile.configurations.items():
+        check_keys(f"{label} [configurations.{name}]", table, (), keys["configurations"])
+
+
+@cache
+def _shipped_keys() -> Mapping[str, set[str]]:
+    """Return the top-level keys of all shipped targets, each with the keys of its table; those of
+    "configurations" are the keys of its builds.
+    """
+    keys: dict[str, set[str]] = {}
+    for name in target_names():
+        for key, content in read_toml("targets", name)[1].items():
+            tables = [content] if isinstance(content, dict) else []
+            if key == "configurations":
+                tables = [*tables[0].values()]
+            keys.setdefault(key, set()).update(*tables)
+    return keys
 
 
 def _with_base(label: str, raw: dict[str, Any]) -> tuple[str, dict[str, Any]]:

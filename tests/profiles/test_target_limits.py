@@ -86,6 +86,27 @@ def test_every_number_within_the_limits_is_taken(
     assert constants[place[1]].value == value
 
 
+@given(place=ANY_KEY)
+def test_a_misspelt_key_or_table_is_refused_with_the_right_name(
+    place: tuple[str, str], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    table, key = place
+    message = refusal(board(tmp_path_factory.mktemp("board"), table, f"{key}x", "1"))
+    name = "configurations.C32B3" if table == BUILD else table
+    assert f"my-board.toml [{name}] has the unknown key '{key}x'; it can have the keys " in message
+    assert message.endswith(f". Write {key!r}.")
+    if table != BUILD:
+        message = refusal(board(tmp_path_factory.mktemp("board"), f"{table}x", key, "1"))
+        assert f"my-board.toml has the unknown key '{table}x'; it can have the keys " in message
+        assert message.endswith(f". Write {table!r}.")
+
+
+@pytest.mark.parametrize("command", ["bench --target", "check --target", "profiles"])
+def test_every_command_refuses_an_unknown_table(command: str, tmp_path: Path) -> None:
+    path = board(tmp_path, "foo", "bar", "1")
+    assert "my-board.toml has the unknown key 'foo'; " in refused(*command.split(), path)
+
+
 @pytest.mark.parametrize("key", ["cores", "aie_cores", "batch_handlers", "cpb"])
 @pytest.mark.parametrize("value", ["0", "-1", "2.5"])
 def test_commands_name_file_key_and_value(key: str, value: str, tmp_path: Path) -> None:
