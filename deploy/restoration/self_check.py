@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from beers_deploy.model.consistency.blocks import Placed
-from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.progress import steps
 from beers_deploy.model.raster.facts import BandInfo, Raster
 from beers_deploy.model.raster.source import Source, strips
-from beers_deploy.model.raster.writer import ArrayPixels, write_raster
+from beers_deploy.model.raster.writer import write_array
 from beers_deploy.model.self_check import (
     BLOCK_PX,
     LEAST_SHARPENING,
@@ -245,5 +244,4 @@ def write_map(path: Path, blocks: BlockMap, raster: Raster) -> None:
         band_info=tuple(infos),
         tags=(),
     )
-    with whole_file(path) as temporary:
-        write_raster(temporary, facts, ArrayPixels(pixels), "zlib", "beers-deploy")
+    write_array(path, facts, pixels)

@@ -153,7 +153,9 @@ def _taken(path: Path, use: str) -> OptionError:
 
 
 def _unwritable(path: Path, reason: str) -> MachineError:
-    return MachineError(f"{printable(str(path))} cannot be written: {reason}. Choose another path.")
+    return MachineError(
+        f"{printable(str(path))} cannot be written: {reason.rstrip('.')}. Choose another path."
+    )
 
 
 def write_text(path: Path, text: str) -> None:

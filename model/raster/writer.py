@@ -28,6 +28,8 @@ from beers_deploy.profiles.errors import CODE_FAULTS, OptionError
 
 RGB = [ColorInterp.red, ColorInterp.green, ColorInterp.blue]
 TILE_PX = 256
+ROOM_BYTES = 8 * TILE_PX**2
+"""The largest size of a tile in bytes, which a disk that is not full has room for."""
 COG_TILE_PX = 512
 
 
@@ -67,7 +69,7 @@ def require_codec(compression: Compression) -> None:
 
 
 def write_raster(
-    path: Path,
+    path: Path | str,
     raster: Raster,
     pixels: Pixels,
     compression: Compression,
@@ -76,7 +78,7 @@ def write_raster(
     """Write a TIFF in tiles of 256 pixels, read it again, and compare.
 
     Args:
-        path: the path of the TIFF; its folder exists.
+        path: the path of the TIFF, whose folder exists, or GDAL's name of a file in memory.
         raster: the size, the type and the metadata of the file.
         pixels: the pixels to write.
         compression: the compression of the tiles.
@@ -85,7 +87,7 @@ def write_raster(
     Raises:
         OSError: the disk cannot be written, or the file differs from the given pixels.
     """
-    with disk_errors(), gdal(GDAL_CACHEMAX=LEAST_CACHE_BYTES, GDAL_TIFF_INTERNAL_MASK="YES"):
+    with disk_errors(path), gdal(GDAL_CACHEMAX=LEAST_CACHE_BYTES, GDAL_TIFF_INTERNAL_MASK="YES"):
         with rasterio.open(path, "w", **_profile(raster, compression)) as file:
             file.update_tags(TIFFTAG_SOFTWARE=software, **dict(raster.tags))
             _describe(file, raster)
@@ -97,7 +99,7 @@ def write_raster(
         require_equal(path, raster, pixels)
 
 
-def require_equal(path: Path, raster: Raster, pixels: Pixels) -> None:
+def require_equal(path: Path | str, raster: Raster, pixels: Pixels) -> None:
     """Read a written TIFF again, and raise OSError if its pixels differ from those that were to be
     written.
 
@@ -139,17 +141,30 @@ def _planes(raster: Raster, pixels: Pixels) -> Iterator[tuple[int, Window, np.nd
 
 
 @contextmanager
-def disk_errors() -> Iterator[None]:
+def disk_errors(output: Path | str | None = None) -> Iterator[None]:
     """Turn any error that GDAL raises within the block, while it writes, into an OSError that
     states its cause.
+
+    Args:
+        output: the path of the file that is written; None where a file is read.
     """
     try:
         yield
     except Exception as error:
+        # GDAL does not state that the disk is full, but Python does if the file cannot grow either.
+        if output is not None and not isinstance(error, CODE_FAULTS):
+            _require_room(Path(output))
         # RasterioIOError is an OSError, and names its cause instead of itself.
         if isinstance(error, (OSError, *CODE_FAULTS)) and error.__cause__ is None:
             raise
         raise OSError(" ".join(str(error.__cause__ or error).split())) from error
+
+
+def _require_room(path: Path) -> None:
+    """Append a tile's size to an unfinished file, which raises the OSError of a full disk."""
+    if path.is_file():
+        with path.open("ab") as file:
+            file.write(bytes(ROOM_BYTES))
 
 
 def _profile(raster: Raster, compression: Compression) -> dict[str, Any]:
@@ -293,15 +308,27 @@ class ArrayPixels:
         return np.full(self.pixels[0, start:stop].shape, 255, np.uint8)
 
 
+def write_array(path: Path, raster: Raster, pixels: np.ndarray) -> None:
+    """Write pixels in memory, (bands, H, W), as a losslessly compressed TIFF; after an error no
+    partial file remains.
+
+    Args:
+        path: the path of the TIFF.
+        raster: the size, the type and the metadata of the file.
+        pixels: the pixels to write, none of which is missing.
+    """
+    # Where GDAL itself writes, libtiff prints each error of a full disk.
+    with whole_file(path) as temporary, MemoryFile() as memory:
+        write_raster(memory.name, raster, ArrayPixels(pixels), "zlib", "beers-deploy")
+        temporary.write_bytes(memory.read())
+
+
 def write_tiff(path: Path, dn: np.ndarray) -> None:
-    """Write an image of one band as a losslessly compressed TIFF; after an error no partial file
-    remains.
+    """Write an image of one band as `write_array` does.
 
     Args:
         path: the path of the TIFF.
         dn: digital numbers (H, W) of an integer or float type.
     """
     height_px, width_px = dn.shape
-    raster = Raster(1, height_px, width_px, dn.dtype)
-    with whole_file(path) as temporary:
-        write_raster(temporary, raster, ArrayPixels(dn[None]), "zlib", "beers-deploy")
+    write_array(path, Raster(1, height_px, width_px, dn.dtype), dn[None])

@@ -1,5 +1,7 @@
 """What was written is read again, and a file that differs from it is an error."""
 
+import errno
+import os
 import warnings
 from pathlib import Path
 from typing import get_args
@@ -14,6 +16,7 @@ from rasterio.enums import ColorInterp
 from beers_deploy.model.raster.compression import Compression
 from beers_deploy.model.raster.facts import MaskKind, Raster
 from beers_deploy.model.raster.writer import ArrayPixels, require_equal, write_raster, write_tiff
+from beers_deploy.profiles.errors import MachineError
 
 
 class Masked(ArrayPixels):
@@ -86,6 +89,30 @@ def test_a_mask_that_differs_from_what_was_written_is_an_error(
     write_raster(path, raster, Masked(pixels), "zlib")
     with pytest.raises(OSError, match="other pixels"):
         require_equal(path, raster, ArrayPixels(pixels))
+
+
+@pytest.mark.parametrize("limit_bytes", [1000, 40_000, 100_000])
+def test_a_file_that_cannot_grow_is_an_error_with_its_cause(
+    limit_bytes: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A limit on the size of files stands for a full disk."""
+    resource = pytest.importorskip("resource", reason="Windows has no such limit")
+    dn = np.random.default_rng(0).integers(0, 4096, (300, 280)).astype(np.uint16)
+    raster = Raster(1, 300, 280, dn.dtype)
+    cause = os.strerror(errno.EFBIG)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, hard))
+    try:
+        with pytest.raises(OSError, match=cause):
+            write_raster(tmp_path / "a.tif", raster, ArrayPixels(dn[None]), "zlib")
+        capfd.readouterr()
+        with pytest.raises(MachineError, match=rf"b\.tif cannot be written: {cause}\. Choose"):
+            write_tiff(tmp_path / "b.tif", dn)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    # Nothing that libtiff prints stands next to the sentence.
+    assert capfd.readouterr().err == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
 
 
 def test_a_small_image_is_read_back(tmp_path: Path) -> None:
