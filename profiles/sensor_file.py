@@ -140,7 +140,9 @@ def _blur(label: str, raw: Mapping[str, object], folder: Path) -> dict[str, Any]
         about = parts["psf"]
         response: Response = validated(PointSpreadFile, values, label, groups).read(label, folder)
     else:
-        about = parts["across"]
+        # Both contrasts have one status, which an axis that was not measured decides.
+        axes = [parts["across"], parts.get("along", parts["across"])]
+        about = next((axis for axis in axes if axis.status == "assumed"), axes[0])
         response = validated(MtfTable, {"along": values["across"], **values}, label, groups)
     return {"response": response, **axes_of(response, about.status, about.source)}
 

@@ -69,10 +69,8 @@ class Frames:
 
     @property
     def hides_black(self) -> bool:
-        """True if the user states no black level although no pixel is near 0, so that the camera
-        probably has one.
-        """
-        return not self.black_dn and self.darkest_dn > DARK_SHARE * self.full_scale_dn
+        """True if no pixel is near 0, so that the camera probably has a black level."""
+        return self.darkest_dn > DARK_SHARE * self.full_scale_dn
 
     def read(self, path: Path) -> np.ndarray:
         """Read the digital numbers (H, W) of one frame, float64, with 0 where they are missing.

@@ -123,7 +123,7 @@ class Measurement:
                 f"the values are multiples of {frames.step}: they count as {frames.bits}-bit "
                 f"numbers; restore these frames with full scale {frames.stored_full_scale}"
             )
-        if frames.hides_black:
+        if self.stated.black_level is None and frames.hides_black:
             yield (
                 f"0 counts as dark, but the darkest pixels have {frames.darkest_dn * frames.step:g}"
                 ": state a black level of the camera as `black_level`, or the SNR in the dark is "
@@ -237,6 +237,7 @@ def _mtf_table(sensor: Measurement, images: str) -> dict[str, object]:
     other = next(iter(sensor.curves))
     for axis in AXES:
         source_axis = axis if axis in sensor.curves else other
+        status: Status = "measured" if axis == source_axis else "assumed"
         curve = sensor.curves[source_axis]
         source = f"{_edges(curve)} {source_axis} the track in {images}"
         intervals = zip(curve.low, curve.high, strict=True)
@@ -245,7 +246,7 @@ def _mtf_table(sensor: Measurement, images: str) -> dict[str, object]:
         if source_axis != axis:
             source += f"; no curve {axis} the track"
         contrast = [float(f"{value:.4g}") for value in curve.contrast]
-        table[axis] = {"value": contrast, "status": "measured", "source": source}
+        table[axis] = {"value": contrast, "status": status, "source": source}
     return table
 
 

@@ -108,7 +108,7 @@ def test_without_a_gain_the_noise_over_full_scale_stands(raw: tuple[Path, Path])
     assert profile["noise"]["radiance_1"]["value"] == pytest.approx(100)
 
 
-def test_a_box_gives_one_axis_for_both(raw: tuple[Path, Path]) -> None:
+def test_a_box_gives_one_axis_for_both(raw: tuple[Path, Path], tmp_path: Path) -> None:
     # The box holds the upper half of the board's upright edge. The simulator cuts 32 pixels off
     # each side of an image.
     middle = SIDE // RATIO // 2 - 32
@@ -121,6 +121,9 @@ def test_a_box_gives_one_axis_for_both(raw: tuple[Path, Path]) -> None:
     table = tomllib.loads(profile_toml(result))["mtf"]
     assert table["across"]["value"] == table["along"]["value"]
     assert "no curve along the track" in table["along"]["source"]
+    assert (table["across"]["status"], table["along"]["status"]) == ("measured", "assumed")
+    (tmp_path / "mine.toml").write_text(profile_toml(result), encoding="utf-8")
+    assert Sensor.load(tmp_path / "mine.toml").mtf_nyquist.status == "assumed"
     assert result.rows()[0].figures["MTF along at Nyquist"].mode == "unavailable"
 
 
@@ -164,6 +167,8 @@ def test_steps_and_a_black_level_change_nothing_but_the_units(
     assert not any("black level" in note for note in result.notes())
     hidden = measure([folder], stated=Stated(bits=15, mtf=(0.1, 0.1)))
     assert any("black level" in note for note in hidden.notes())
+    none = measure([folder], stated=Stated(bits=15, black_level=0, mtf=(0.1, 0.1)))
+    assert not any("black level" in note for note in none.notes())
 
 
 def test_pairs_of_one_scene_give_the_noise_alone(tmp_path: Path) -> None:
