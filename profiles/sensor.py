@@ -157,6 +157,18 @@ class Sensor:
                 )
         return self
 
+    @model_validator(mode="after")
+    def _offset_is_possible(self) -> Self:
+        """Raise ValueError if the offset alone saturates every pixel."""
+        largest_dn = 2**self.bits.low - 1
+        offset_dn = self.units[2]
+        if offset_dn >= largest_dn:
+            raise ValueError(
+                f"offset.offset_dn must be below {largest_dn:g}, the largest digital number of "
+                f"{self.bits} bits, but it is {offset_dn:g}. Correct one of the two."
+            )
+        return self
+
     @classmethod
     def load(cls, sensor: "Sensor | str | os.PathLike[str]") -> "Sensor":
         """Load a shipped sensor by its name, or a user's sensor by the path of its .toml file.

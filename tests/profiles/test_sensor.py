@@ -91,6 +91,18 @@ def test_the_track_may_have_a_contrast_of_its_own(tmp_path: Path) -> None:
     assert len({sensor.mtf_axes[1] for sensor in draws}) == 40
 
 
+@given(st.integers(1, 16), st.floats(0, 65535))
+def test_an_offset_that_saturates_every_pixel_is_refused(bits: int, offset_dn: float) -> None:
+    fields = {"bits": bits, "effects": {"offset": {"offset_dn": offset_dn}}}
+    sensor = Sensor.load("pleiades-degraded")
+    largest_dn = 2**bits - 1
+    if offset_dn < largest_dn:
+        assert sensor.with_fields(**fields).nominal().offset_dn == offset_dn
+        return
+    with pytest.raises(ProfileError, match=f"below {largest_dn}, .* it is {offset_dn:g}\\."):
+        sensor.with_fields(**fields)
+
+
 def test_missing_profiles_and_files(tmp_path: Path) -> None:
     with pytest.raises(ProfileError, match="pleiades-degraded"):
         Sensor.load("hubble")
