@@ -8,6 +8,7 @@ from.
 
 import json
 import logging
+import math
 import multiprocessing
 import shutil
 import sys
@@ -100,17 +101,22 @@ def plan_windows(recipe: DatasetRecipe) -> list[Window]:
     too small.
     """
     windows: list[Window] = []
-    small: list[str] = []
+    small: list[Path | None] = []
     for index, path in enumerate(recipe.scenes):
         scene_windows = list(_scene_windows(recipe, index, len(windows)))
         if not scene_windows:
-            small.append(str(path))
+            small.append(path)
         windows += scene_windows
     if small:
         side = ((recipe.patch_px or 1) + 2 * MARGIN_PX) * recipe.oversampling
-        raise ImageError(
-            f"Less than {side} scene pixels a side: {', '.join(small)}. Leave that out."
-        )
+        side = math.ceil(side / recipe.scene_scale)
+        if small == [None]:
+            raise ImageError(
+                f"The drawn scene has less than {side} scene pixels a side. Give `images` with "
+                "scenes of at least that size."
+            )
+        names = ", ".join(str(path or "the drawn scene") for path in small)
+        raise ImageError(f"Less than {side} scene pixels a side: {names}. Leave that out.")
     return windows
 
 

@@ -96,7 +96,7 @@ def calling_for(
         forbid: names of effects to remove.
 
     Raises:
-        OptionError: if a name is not that of an effect.
+        OptionError: if a name is not that of an effect, or is in `add` and in `forbid`.
         ProfileError: if the resulting profile is contradictory.
     """
     for name in (*add, *forbid):
@@ -105,6 +105,11 @@ def calling_for(
                 f"There is no effect {name!r}. Correct the name, which must be one of "
                 f"{', '.join(TABLES)}."
             )
+    if both := {*add} & {*forbid}:
+        raise OptionError(
+            f"The simulation both adds and forbids {', '.join(sorted(both))} (`with_`, `without`). "
+            "Remove one of the two."
+        )
     typical = typical_effects()
     effects = {**profile.effects, **(scene.effects if scene else {})}
     effects |= {name: typical[name] for name in add if name not in effects}

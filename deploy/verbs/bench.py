@@ -120,6 +120,8 @@ def bench(
     from beers_deploy.profiles.sensor import Sensor
     from beers_deploy.results import inputs_of, require_same
 
+    if within == 0:
+        raise OptionError("`within` must be above 0 s, got 0.")
     tiles_px = parse_tiles(tile)
     profile = Sensor.load(sensor)
     paths = [path_or_none(path) for path in (image, measured)]

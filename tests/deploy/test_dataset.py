@@ -249,6 +249,12 @@ def test_a_scene_without_room_for_a_patch_is_refused(scene: Path) -> None:
         plan_windows(small(scene, patch_px=200))
 
 
+def test_a_drawn_scene_without_room_asks_for_images(scene: Path) -> None:
+    drawn = replace(small(scene, patch_px=1500), scenes=(None,), oversampling=5)
+    with pytest.raises(ImageError, match=r"drawn scene .* 7820 .* `images`"):
+        plan_windows(drawn)
+
+
 def test_a_drawn_scene_needs_no_file(scene: Path) -> None:
     windows = plan_windows(replace(small(scene), scenes=(scene, None)))
     assert {window.scene for window in windows} == {0, 1}
@@ -274,6 +280,9 @@ def test_effects_are_added_and_forbidden() -> None:
     assert transmittance.low == 0.6
     with pytest.raises(OptionError, match="clouds"):
         calling_for(profile, None, ["clouds"])
+    for name in TABLES:
+        with pytest.raises(OptionError, match=f"both adds and forbids {name} "):
+            calling_for(profile, None, ["prnu", name], [name])
 
 
 def test_each_effect_says_who_asks_for_it() -> None:

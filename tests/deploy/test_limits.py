@@ -54,6 +54,11 @@ def test_a_command_says_how_many(
     assert [path.name for path in tmp_path.iterdir()] == ["raw.tif"]
 
 
+@pytest.mark.parametrize("seconds", ["0", "-1", "-0.0", "nan"])
+def test_a_swath_takes_some_time(seconds: str) -> None:
+    assert "--within" in refused("bench", "--no-traditional", "--within", seconds)
+
+
 def bounded_options() -> Iterator[tuple[str, str]]:
     """Yield the command and the label of every option that has a largest value."""
     for name in COMMANDS:

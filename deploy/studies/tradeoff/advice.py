@@ -117,7 +117,11 @@ def _parse(option: str, text: str) -> Constraint:
             f"{printable(repr(fields['unit']))}. Write "
             f"{fields['name']}{fields['side']}{fields['limit']}{unit}."
         )
-    return Constraint(key, fields["side"] == "<=", float(fields["limit"]), unit)
+    limit = Constraint(key, fields["side"] == "<=", float(fields["limit"]), unit)
+    # Every figure that can have an upper limit is above 0, so that no point would comply.
+    if limit.at_most and limit.limit <= 0:
+        raise OptionError(f"`{option}` must give an upper limit above 0, but it is {limit}.")
+    return limit
 
 
 @dataclass(frozen=True)

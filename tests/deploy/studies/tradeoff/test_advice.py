@@ -152,6 +152,8 @@ def test_every_figure_can_be_limited_in_its_unit(name: str) -> None:
         ("speed<=3", "one of psnr"),
         ("latency<=20ms", "board latency in s"),
         ("psnr>=44,", "NAME<=NUMBER"),
+        ("latency<=-5s", "above 0, but it is board latency <= -5 s"),
+        ("host<=0", "above 0, but it is host p50 <= 0 s/Mpx"),
     ],
 )
 def test_what_is_no_constraint_is_refused(text: str, words: str) -> None:
