@@ -97,7 +97,7 @@ def sensor_vector(sensor: Instrument) -> SensorVector:
         if inside != value:
             outside.append(
                 f"{name} {value:.3g} is outside the range of the training, {low:g} to {high:g}; "
-                f"the network uses {inside:g} and may restore worse than without a profile"
+                f"the network uses {inside:g} and may restore worse than the traditional pipeline"
             )
         entries.append(2 * math.log(inside / low) / math.log(high / low) - 1)
     lower, higher = sorted((values["mtf_across"], values["mtf_along"]))

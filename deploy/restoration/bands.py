@@ -111,7 +111,7 @@ def _log_network(network: Network, sensors: Mapping[str, Sensor]) -> None:
     elif is_unknown(sensors):
         logger.info(
             "network: %s, for an unknown sensor: the result may be worse than the image if yours "
-            "is sharper than assumed. Name it with `sensor`",
+            "is sharper or noisier than assumed. Name it with `sensor`",
             network.name,
         )
     else:

@@ -22,6 +22,7 @@ from beers_deploy.network import Network
 from beers_deploy.profiles.figures import Figure, measured, unavailable
 from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.cluster import Cluster
+from beers_deploy.restoration.detectors.fault_list import FOUND
 from beers_deploy.restoration.detectors.look import warn_of_detectors
 from beers_deploy.restoration.memory import check_memory, rows_bytes
 from beers_deploy.restoration.outcome import Tally
@@ -387,7 +388,7 @@ def check_sensor(
         ImageError: the image contradicts its sensor, and the option `strict` is set.
     """
     started = time.perf_counter()
-    warn_of_detectors(source, full_scale)
+    warn_of_detectors(source, full_scale, reading.fix_detectors != FOUND)
     check = checked_sensor(source, reading.sensors, full_scale, name, reading.strict)
     # A check without figures had no sensor to compare with.
     if not check.figures and not reading.force:

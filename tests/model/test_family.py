@@ -58,6 +58,7 @@ def test_what_lies_outside_is_moved_to_the_end_and_said(sensor: Instrument, name
     sentences = [sentence for sentence in vector.outside if sentence.startswith(name)]
     assert len(sentences) == 1
     assert "outside" in sentences[0]
+    assert sentences[0].endswith("may restore worse than the traditional pipeline")
 
 
 @pytest.mark.parametrize(

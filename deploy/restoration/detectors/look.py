@@ -196,45 +196,52 @@ def _sections(width_px: int) -> list[slice]:
 SHARPENS = "restoration about doubles it"
 EQUALIZE = "equalise the image first"
 TRAIN = "or use a network that was trained with the effects prnu and dsnu"
-FIX = f"`fix_detectors` {FOUND} replaces"
+FIX = f"; `fix_detectors` {FOUND} replaces such "
 ERRORS = 2.0
 """The number of standard errors in an interval of 95 %."""
 NAMED = 3
 """The largest number of places that a sentence names."""
 
 
-def warn_of_detectors(source: Source, full_scale: float) -> Mapping[str, Figure]:
+def warn_of_detectors(
+    source: Source, full_scale: float, advise_fix: bool = True
+) -> Mapping[str, Figure]:
     """Detect faults of detectors in strips of an image, and log a warning for each kind of fault.
 
     Args:
         source: the image.
         full_scale: the pixel value at and above which a pixel is saturated and does not count.
+        advise_fix: False if the run has replaced the faults that it found, so that no warning
+            recommends it.
 
     Returns:
         The figures of the faults by name, for a row of results.
     """
     bands = look_at_detectors(source, full_scale)
-    for sentence in sentences(bands):
+    for sentence in sentences(bands, advise_fix):
         logger.warning(sentence)
     return figures(bands)
 
 
-def sentences(bands: Sequence[BandFaults]) -> list[str]:
+def sentences(bands: Sequence[BandFaults], advise_fix: bool = True) -> list[str]:
     """Return the warnings on faults of detectors, one for each kind of fault in each band.
 
     Args:
         bands: the faults of each band, in the order of the bands.
+        advise_fix: whether to recommend that faults are found and replaced.
     """
     messages = []
     for number, band in enumerate(bands, 1):
         where = f"band {number}: " if len(bands) > 1 else ""
-        messages += [f"look at the detectors: {where}{words}" for words in _of_band(band)]
+        messages += [
+            f"look at the detectors: {where}{words}" for words in _of_band(band, advise_fix)
+        ]
     return messages
 
 
-def _of_band(band: BandFaults) -> Iterator[str]:
-    yield from _of_lines("column", band.columns)
-    yield from _of_lines("row", band.rows)
+def _of_band(band: BandFaults, advise_fix: bool) -> Iterator[str]:
+    yield from _of_lines("column", band.columns, advise_fix)
+    yield from _of_lines("row", band.rows, advise_fix)
     for pattern in band.patterns:
         if pattern.significant:
             yield _of_pattern(pattern)
@@ -242,17 +249,17 @@ def _of_band(band: BandFaults) -> Iterator[str]:
         places = [f"column {column}, row {row}" for row, column in band.pixels.tolist()]
         yield (
             f"{counted(len(places), 'pixel')} of {band.looked_px}, isolated as no light can be: "
-            f"hot, dead or hit by a particle ({_some(places)}); restoration sharpens that; {FIX} "
-            "such pixels"
+            f"hot, dead or hit by a particle ({_some(places)}); restoration sharpens that"
+            f"{FIX + 'pixels' if advise_fix else ''}"
         )
 
 
-def _of_lines(one: str, lines: Stripes) -> Iterator[str]:
+def _of_lines(one: str, lines: Stripes, advise_fix: bool) -> Iterator[str]:
     if lines.dead:
         places = [f"{one} {line}" for line in lines.dead]
         yield (
             f"{counted(len(places), f'dead {one}')}, constant where the others vary "
-            f"({_some(places)}); restoration sharpens that; {FIX} such {one}s"
+            f"({_some(places)}); restoration sharpens that{f'{FIX}{one}s' if advise_fix else ''}"
         )
     places = [f"{one} {line.index} by {line.gain:+.2%}" for line in lines.off]
     if lines.significant and lines.spread is not None:

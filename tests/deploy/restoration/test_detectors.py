@@ -207,6 +207,10 @@ def test_sentences_name_kind_place_and_remedy() -> None:
         "alternate columns",
     ):
         assert any(words in sentence for sentence in lines), words
+    remedy = "; `fix_detectors` found replaces such "
+    without = sentences(look_at_detectors(source_of(clipped), 5000), advise_fix=False)
+    assert without == [sentence.split(remedy)[0] for sentence in lines]
+    assert without != lines
     assert not sentences(look_at_detectors(source_of(ground(HEIGHT, WIDTH)), 4095))
 
 
@@ -254,6 +258,25 @@ def test_a_restoration_sees_the_replaced_pixels(image: Path, model: Path, tmp_pa
     shown = done(f"restore {image} --dry-run --network {model}")
     assert "look at the detectors: 1 dead column" in shown
     assert "dead lines" in shown
+
+
+def test_no_warning_recommends_what_was_asked_for(
+    image: Path,
+    model: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """The finder leaves what the look at the detectors sees."""
+    monkeypatch.setattr(
+        "beers_deploy.restoration.detectors.fix.find_faults", lambda *_: FaultList(())
+    )
+    for choice, count in ((None, 1), ("found", 0)):
+        caplog.clear()
+        restore(image, tmp_path / f"{choice}.tif", network=model, tile=64, fix_detectors=choice)
+        warnings = [text for text in caplog.messages if "1 dead column" in text]
+        assert len(warnings) == 1
+        assert warnings[0].count("found replaces") == count
 
 
 def test_a_stopped_run_goes_on_with_the_same_faults_and_no_others(
