@@ -2,9 +2,10 @@
 them.
 
 1. Set the free sizes of the image to numbers, so that the runtime folds arithmetic on shapes.
-2. Write a Resize to a size as one by factors, and the pixel unshuffle of one channel as
-   SpaceToDepth. Remove a Pad by nothing and a Slice of the whole map. Let a convolution write a map
-   of one number per channel, such as a noise level.
+2. Write a Resize to a size as one by factors, the pixel unshuffle of one channel as SpaceToDepth,
+   and that of several channels within the network, and a shuffle of channels, as a convolution.
+   Remove a Pad by nothing, a Slice of the whole map, and an Expand that arithmetic does anyway. Let
+   a convolution write a map of one number per channel, such as a noise level.
 3. Do both for two sizes. If the networks are equal, the size has no effect, and theirs is the
    network of every image whose sides are multiples of `MULTIPLE_PX`. Otherwise the network is not
    changed.
@@ -21,16 +22,18 @@ import onnx
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
+from beers_deploy.quant.simplify.rearrangements import (
+    RESHAPING,
+    is_rearrangement,
+    rearranged,
+)
 
 MULTIPLE_PX = 64
 """Six levels of a U-Net halve sides of this length without a remainder."""
 SIZES_PX = (2 * MULTIPLE_PX, 3 * MULTIPLE_PX), (4 * MULTIPLE_PX, 3 * MULTIPLE_PX)
 """Rows and columns differ, so that a network that confuses them is detected."""
-SIZED = {"Concat", "Pad", "Resize", "Shape", "Size", "Slice"}
+SIZED = {"Concat", "Expand", "Pad", "Resize", "Shape", "Size", "Slice"}
 """Operators that may need the size of an image."""
-RESHAPING = {"Flatten", "Reshape", "Squeeze", "Unsqueeze"}
-"""Operators that move no value."""
-
 Fold = Callable[[onnx.ModelProto], onnx.ModelProto]
 """A function that folds constants, as onnxruntime does."""
 
@@ -48,9 +51,11 @@ def free_sizes(model: onnx.ModelProto, fold: Fold) -> onnx.ModelProto:
         has an effect.
     """
     constants = {tensor.name for tensor in model.graph.initializer}
+    graph = OnnxGraph(model)
     if not any(
-        node.op_type in SIZED and (node.op_type != "Concat" or constants.intersection(node.input))
-        for node in model.graph.node
+        is_rearrangement(graph, node)
+        or (node.op_type in SIZED and (node.op_type != "Concat" or constants & {*node.inputs}))
+        for node in graph.nodes
     ):
         return model
     try:
@@ -116,7 +121,7 @@ def _sized(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> l
     before = sizes.get(source, ())
     after = sizes.get(node.outputs[0], ())
     if node.op_type in RESHAPING and before != after:
-        return _unshuffled(graph, node, sizes)
+        return rearranged(graph, node, sizes)
     if len(before) != 4 or len(after) != 4 or min(*before, *after) < 1:
         return None
     if node.op_type == "Resize" and len(node.inputs) == 4:
@@ -136,44 +141,18 @@ def _sized(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> l
         and all(step == 1 for step in graph.numbers(node, 4, "steps") or ())
     )
     adds_nothing = node.op_type == "Pad" and graph.numbers(node, 1, "pads") == [0] * 8
-    if keeps_all or adds_nothing or node.op_type in RESHAPING:
+    expands_in_vain = node.op_type == "Expand" and all(
+        reader.op_type in ("Add", "Mul", "Sub") and after in _others(reader, node, sizes)
+        for reader in graph.readers[node.outputs[0]]
+    )
+    if keeps_all or adds_nothing or expands_in_vain or node.op_type in RESHAPING:
         return [Node.new("Identity", [source], node.outputs[0], node.name)]
     return None
 
 
-def _unshuffled(
-    graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]
-) -> list[Node] | None:
-    """Return the pixel unshuffle that ends in a Reshape.
-
-    Args:
-        graph: the graph that the node belongs to.
-        node: a Reshape, or another operator that moves no value.
-        sizes: the sizes of each tensor, for the images that are tried.
-
-    Returns:
-        A SpaceToDepth of the image; None if the nodes are no pixel unshuffle of one channel.
-    """
-
-    def before_reshapes(name: str) -> str:
-        """Return the tensor that operators which move no value turn into this one."""
-        writer = graph.sole_writer(name)
-        while writer is not None and writer.op_type in RESHAPING:
-            name = writer.inputs[0]
-            writer = graph.sole_writer(name)
-        return name
-
-    # A pixel unshuffle is a Reshape to (N, C, H, r, W, r), this transposition and another Reshape.
-    moved = graph.sole_writer(before_reshapes(node.inputs[0]))
-    if moved is None or moved.attributes.get("perm") != [0, 1, 3, 5, 2, 4]:
-        return None
-    source = before_reshapes(moved.inputs[0])
-    count, channels, rows, block, columns, across = sizes.get(moved.inputs[0], (0,) * 6)
-    is_whole = sizes.get(source) == (count, 1, rows * block, columns * block)
-    result = (count, block * block, rows, columns)
-    if channels != 1 or block != across or not is_whole or sizes[node.outputs[0]] != result:
-        return None
-    return [Node.new("SpaceToDepth", [source], node.outputs[0], node.name, blocksize=block)]
+def _others(reader: Node, writer: Node, sizes: dict[str, tuple[int, ...]]) -> list[tuple[int, ...]]:
+    """Return the sizes of what a node reads besides the result of another node."""
+    return [sizes.get(name, ()) for name in reader.inputs if name != writer.outputs[0]]
 
 
 def _with_written_maps(

@@ -3,7 +3,8 @@
 `quant.onnx_file.load_onnx` does it once for all readers of a file. Afterwards a float network has
 these properties:
 
-1. Constants are initializers, each float32 even if it was float16, and no initializer is an input.
+1. Constants are initializers, each float32 even if it was float16 or float64, and no initializer is
+   an input.
 2. There is no Identity, Constant, Dropout, needless Cast, and no arithmetic on constants.
 3. There is no BatchNormalization, and no Mul, Add, Sub or Div by one constant per channel, behind a
    convolution that only it reads, nor in front of convolutions where folding is exact. A remaining
@@ -58,8 +59,10 @@ from beers_deploy.quant.simplify.fold_affine import (
 )
 from beers_deploy.quant.simplify.free_sizes import free_sizes
 from beers_deploy.quant.simplify.fully_connected import ConnectByConvolutions
+from beers_deploy.quant.simplify.image_residual import add_to_image, clip_last
 from beers_deploy.quant.simplify.large_kernels import is_large, split_large_kernel
 from beers_deploy.quant.simplify.missing_border import with_missing_border
+from beers_deploy.quant.simplify.repeat_channels import repeat_channels
 from beers_deploy.quant.simplify.spelled_activations import (
     halve_before_gelu,
     join_hard_swish,
@@ -98,7 +101,7 @@ ALTERING = [
 slices into a Gather, and prevent pixel shuffles from being recognised.
 """
 
-HALVES = (TensorProto.FLOAT16, TensorProto.BFLOAT16)
+OTHER_FLOATS = (TensorProto.FLOAT16, TensorProto.BFLOAT16, TensorProto.DOUBLE)
 
 
 def simplify(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
@@ -121,7 +124,7 @@ def simplify(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 
 def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     network = deepcopy(model)
-    _widen(network)
+    _to_float32(network)
     channels_first(network)
     weights = {tensor.name for tensor in network.graph.initializer}
     inputs = [value for value in network.graph.input if value.name not in weights]
@@ -150,6 +153,8 @@ def _run_passes(model: onnx.ModelProto) -> None:
         join_relu,
         join_hard_swish,
         halve_before_gelu,
+        clip_last,
+        add_to_image,
         add_negated,
         fold_behind,
         split_large_kernel,
@@ -167,6 +172,7 @@ def _run_passes(model: onnx.ModelProto) -> None:
         unshuffle_slices,
         split_channels,
         convolve_crop,
+        repeat_channels,
     ):
         graph.rewrite(partial(with_shapes, shapes))
     # A normalisation that has become a convolution takes in what stands around it.
@@ -181,7 +187,7 @@ def _is_plain(model: onnx.ModelProto) -> bool:
     return (
         opset_of(model) == OPSET
         and not any(
-            tensor.data_type in HALVES or is_large(tuple(tensor.dims))
+            tensor.data_type in OTHER_FLOATS or is_large(tuple(tensor.dims))
             for tensor in model.graph.initializer
         )
         and not any(value.name in weights for value in model.graph.input)
@@ -194,19 +200,21 @@ def _is_plain(model: onnx.ModelProto) -> bool:
     )
 
 
-def _widen(model: onnx.ModelProto) -> None:
-    """Convert 16-bit floats to float32, in weights and in all computations."""
+def _to_float32(model: onnx.ModelProto) -> None:
+    """Convert floats of 16 and 64 bits to float32, in weights and in all computations."""
     graph = model.graph
     for value in (*graph.input, *graph.output, *graph.value_info):
-        if value.type.tensor_type.elem_type in HALVES:
+        if value.type.tensor_type.elem_type in OTHER_FLOATS:
             value.type.tensor_type.elem_type = TensorProto.FLOAT
     for tensor in held_tensors(graph):
-        if tensor.data_type in HALVES:
-            values = numpy_helper.to_array(tensor).astype(np.float32)
+        if tensor.data_type in OTHER_FLOATS:
+            # What overflows is infinite, and is refused as such.
+            with np.errstate(over="ignore"):
+                values = numpy_helper.to_array(tensor).astype(np.float32)
             tensor.CopyFrom(numpy_helper.from_array(values, tensor.name))
     for attribute in chain.from_iterable(node.attribute for node in graph.node):
         if attribute.name in ("to", "dtype"):
-            attribute.i = TensorProto.FLOAT if attribute.i in HALVES else attribute.i
+            attribute.i = TensorProto.FLOAT if attribute.i in OTHER_FLOATS else attribute.i
 
 
 def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:

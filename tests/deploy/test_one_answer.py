@@ -98,6 +98,7 @@ PARTS: dict[str, Part] = {
         coordinate_transformation_mode="asymmetric",
         nearest_mode="floor",
     ),
+    "one channel": lambda w, x: w.add("Mul", x, w.conv(x, 1, CHANNELS, pad=1)),
     "leaky": lambda w, x: w.add("LeakyRelu", x, alpha=0.3),
     "hard sigmoid": lambda w, x: w.add("HardSigmoid", x, alpha=0.2),
     "mean over channels": lambda w, x: w.add("Sub", x, w.add("ReduceMean", x, axes=[1])),
@@ -117,14 +118,16 @@ def drawn(
     padded: bool = True,
     ends: tuple[float, float] = (0.0, 1.0),
     has_two: bool = False,
+    is_active: bool = False,
 ) -> Path:
     """Write a network of these parts between two convolutions, for images of a range.
 
-    It may have an output of twice the sampling too.
+    It may have an output of twice the sampling too, and an activation of the image.
     """
     w = Drawn(int(padded))
     size = ends[1] - ends[0]
-    last = w.conv("image", CHANNELS, 1, gain=1 / size)
+    first = w.add("Relu", "image") if is_active else "image"
+    last = w.conv(first, CHANNELS, 1, gain=1 / size)
     for part in parts:
         last = PARTS[part](w, last)
     large = w.conv(last, 4, CHANNELS, gain=size)
@@ -151,6 +154,7 @@ def drawn(
     adds_image=st.booleans(),
     clips=st.booleans(),
     padded=st.booleans(),
+    is_active=st.booleans(),
     ends=st.sampled_from(RANGES),
     output=st.sampled_from([None, "restored", "large"]),
 )
@@ -225,6 +229,44 @@ def test_unpadded_networks_of_a_fixed_size_get_one_answer(tmp_path: Path) -> Non
         swath = bd.bench(network, tile=32, traditional=False)
         assert not any("whole images" in note for note in swath.notes)
         assert bd.restore(image, network=network, **how).shape == image.shape
+
+
+@pytest.mark.parametrize(
+    ("sizes", "remedy"),
+    [
+        ([1, 1, "H", 32], "with free or with equal height and width"),
+        ([1, 1, 32, 48], "with free or with equal height and width"),
+        ([4, 1, "H", "W"], "for one image, or for any number of them"),
+        ([1, "C", "H", "W"], "with a fixed number of channels"),
+    ],
+)
+def test_an_input_that_is_no_image_has_one_remedy(
+    sizes: list[int | str], remedy: str, tmp_path: Path
+) -> None:
+    """Every command states the same reason, `check` in a table if the sizes fit a tile."""
+    path = drawn(tmp_path / "a.onnx", ["relu"], adds_image=True, clips=False)
+    samples = np.random.default_rng(1).uniform(0, 1, (4, 1, 32, 32)).astype(np.float32)
+    with one_guess():
+        int8 = bd.quantize(path, samples=samples, progress=False)
+    model = onnx.load(path)
+    (image,) = model.graph.input
+    image.CopyFrom(helper.make_tensor_value_info("image", onnx.TensorProto.FLOAT, sizes))
+    onnx.save(model, path)
+
+    def check() -> None:
+        checked = bd.check(path)
+        assert not checked
+        raise ModelError(checked.verdict)
+
+    for command in (
+        check,
+        lambda: bd.quantize(path, samples=samples, progress=False),
+        lambda: bd.gate(path, int8, samples=samples, progress=False),
+        lambda: bd.bench(path, size="64x64", traditional=False),
+        lambda: bd.restore(samples[0, 0], network=path, full_scale=1, progress=False),
+    ):
+        with pytest.raises(ModelError, match=f"The input 'image' must .* network {remedy}"):
+            command()
 
 
 def test_quantize_says_what_restore_refuses(tmp_path: Path) -> None:

@@ -194,6 +194,9 @@ def activation_place(op: Operation, dpu: Dpu) -> Finding | None:
     {activations[alone]} ({activations[alone].source}).
     """
     place = PLACE.get(op.follows or "")
+    # `quantize` lets a convolution copy the image, mirrored or not, for what reads it and is none.
+    if op.follows in (None, "pad") and not op.integer:
+        place = "conv"
     fused = dpu.target.activations[place].value if place else ()
     # An activation after a sum is checked by `activation_of_sums`.
     if place == "sum" or MANUAL[op.op_type] in (*fused, *dpu.target.activations["alone"].value):

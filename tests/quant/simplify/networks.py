@@ -42,6 +42,7 @@ NUMBERS = {
     "one_three": [1, 3],
     "axes": [2, 3],
     "map_again": [-1, 4, 1, 1],
+    "four_channels": [1, 4, 1, 1],
 }
 
 
@@ -142,6 +143,27 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
     "a residual taken away": (f"{CONV} y = Sub(x, c)", {"Conv": 1, "Add": 1}),
     "a convolution less the image": (f"{CONV} y = Sub(c, x)", {"Conv": 2, "Add": 1}),
     "normalised, and read elsewhere": (f"{CONV} n {NORMAL} y = Add(c, n)", {"Conv": 2, "Add": 1}),
+    "added to the image as it is normalised": (
+        f"""m = Mul(x, image) n = Sub(m, half) c = {SAME}(n, w) a = Add(n, c)
+        p = Add(a, half) y = Div(p, image)""",
+        {"Mul": 1, "Sub": 1, "Conv": 1, "Add": 1},
+    ),
+    "added to the image as it is normalised, and left so": (
+        f"m = Mul(x, six) n = Sub(m, half) c = {SAME}(n, w) a = Add(n, c) y = Add(a, half)",
+        {"Mul": 1, "Sub": 1, "Conv": 1, "Add": 2},
+    ),
+    "clipped in another range": (
+        f"m = Mul(x, six) c = {SAME}(m, w) a = Add(c, m) k = Clip(a, zero, six) y = Div(k, six)",
+        {"Conv": 1, "Add": 1, "Clip": 1},
+    ),
+    "one channel times four": (
+        f"c = {SAME}(x, one) d = {SAME}(x, w) y = Mul(c, d)",
+        {"Conv": 3, "Mul": 1},
+    ),
+    "one channel four times": (
+        f"c = {SAME}(x, one) t = Tile(c, four_channels) y = Mul(t, x)",
+        {"Conv": 2, "Mul": 1},
+    ),
     "zeros around": ("p = Pad(x, pads) y = Conv(p, w)", {"Conv": 1}),
     "zeros around, lopsided": ("p = Pad(x, around) y = Conv(p, w)", {"Conv": 1}),
     "a mirror around": ('p = Pad<mode="reflect">(x, pads) y = Conv(p, w)', {"Pad": 1, "Conv": 1}),

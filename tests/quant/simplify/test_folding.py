@@ -125,8 +125,8 @@ def test_an_operator_that_our_opset_lacks_stays_of_its_own() -> None:
     assert short.opset_import[0].version == 20
 
 
-@pytest.mark.parametrize("kind", ["float16", "bfloat16"])
-def test_weights_of_16_bits_become_float32(kind: str) -> None:
+@pytest.mark.parametrize("kind", ["float16", "bfloat16", "double"])
+def test_weights_of_other_floats_become_float32(kind: str) -> None:
     model = made(f"{CONV} n {NORMAL} y = Relu(n)", kind=kind)
     short = simplify(model, "a.onnx")
     assert {t.data_type for t in short.graph.initializer} == {TensorProto.FLOAT}

@@ -74,6 +74,27 @@ class Gated(nn.Module):
         return image + correction
 
 
+class Shuffled(Gated):
+    """ShuffleNet's shuffle of channels, ESPCN's pixel unshuffle within, and a gate of one channel
+    that is expanded.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gate = nn.Conv2d(2 * FEATURES, 1, 1)
+        self.tail = nn.Conv2d(8 * FEATURES, 4, 1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Images (N, 1, H, W) to the same."""
+        wide: Tensor = self.wide(image)
+        count, channels, rows, columns = wide.shape
+        pairs = wide.reshape(count, 2, channels // 2, rows, columns).transpose(1, 2)
+        deep = self.deep(pairs.reshape(count, channels, rows, columns))
+        gated = deep * functional.hardsigmoid(self.gate(deep)).expand_as(deep)
+        correction = self.tail(functional.pixel_unshuffle(gated, 2))
+        return image + functional.pixel_shuffle(correction, 2)
+
+
 class NoiseLevel(nn.Module):
     """FFDNet's map of one noise level, as a constant."""
 
@@ -123,7 +144,9 @@ def exported(module: nn.Module) -> onnx.ModelProto:
     return onnx.load_model_from_string(file.getvalue())
 
 
-@pytest.mark.parametrize("make", [PaddedUNet, ResizedUNet, Gated, NoiseLevel, UnshuffledNoiseLevel])
+@pytest.mark.parametrize(
+    "make", [PaddedUNet, ResizedUNet, Gated, Shuffled, NoiseLevel, UnshuffledNoiseLevel]
+)
 def test_sizes_are_gone_and_results_are_the_same(make: Callable[[], nn.Module]) -> None:
     """Also for sides that are no multiples of 64, as far as the network halves them evenly."""
     model = exported(make())
