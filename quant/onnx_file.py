@@ -313,18 +313,42 @@ def fixed_tile_px(model: onnx.ModelProto) -> int | None:
     any size.
 
     Raises:
-        ModelError: the model has not exactly one input (N, C, H, W), or H and W differ.
+        ModelError: the model has not exactly one input, or it is not one image (`require_image`).
     """
-    sizes = []
-    if model.graph.input:
-        sizes = [d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim]
-    if len(model.graph.input) != 1 or len(sizes) != 4 or sizes[2] != sizes[3]:
+    if len(model.graph.input) != 1:
         raise ModelError(
-            "The network must have one input (N, C, H, W), with H equal to W if they are fixed, "
-            f"but it has {len(model.graph.input)}, the first of the sizes {sizes} (0 is free). "
-            "Export it with 'beers-deploy export'."
+            f"The network must have one input (N, C, H, W), but it has {len(model.graph.input)}. "
+            "Export it with one image as its input."
         )
+    image = model.graph.input[0]
+    sizes = [d.dim_value for d in image.type.tensor_type.shape.dim]
+    require_image(image.name, sizes)
     return sizes[2] or None
+
+
+def require_image(name: str, sizes: Sequence[int], square: bool = True) -> None:
+    """Raise ModelError unless an input is one image of stated channels.
+
+    Args:
+        name: the name of the input.
+        sizes: the sizes that the file states, 0 where it states none.
+        square: True to require also that height and width are equal, or both free.
+    """
+    if len(sizes) != 4 or sizes[0] > 1:
+        rule = "be one image (N, C, H, W)"
+        remedy = "for one image, or for any number of them"
+    elif sizes[1] < 1:
+        rule = "state its number of channels, the second size"
+        remedy = "with a fixed number of channels"
+    elif square and sizes[2] != sizes[3]:
+        rule = "have a height and width that are equal or both free"
+        remedy = "with free or with equal height and width"
+    else:
+        return
+    raise ModelError(
+        f"The input {printable(repr(name))} must {rule}, but its sizes are {list(sizes)} (0 is "
+        f"free). Export the network {remedy}."
+    )
 
 
 def any_size(model: onnx.ModelProto) -> onnx.ModelProto:

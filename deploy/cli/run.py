@@ -70,7 +70,8 @@ def run(
         raise typer.Exit(code) from None
     if table is not None and not table:
         if quiet:
-            typer.echo(f"beers-deploy: {one_line(table.verdict)}", err=True)
+            verdict = in_options(table.verdict, command.verb)
+            typer.echo(f"beers-deploy: {one_line(verdict)}", err=True)
         raise typer.Exit(1)
 
 
@@ -132,7 +133,10 @@ def _show(result: Any, command: Command, quiet: bool, verbose: bool) -> None:
         for row in table.rows:
             words = {key: in_options(text, command.verb) for key, text in row.text.items()}
             rows.append(replace(row, text=words))
-        replace(table, notes=notes, rows=tuple(rows)).print(details=verbose)
+        checks = tuple(
+            replace(check, detail=in_options(check.detail, command.verb)) for check in table.checks
+        )
+        replace(table, notes=notes, rows=tuple(rows), checks=checks).print(details=verbose)
     elif isinstance(result, str):
         # A terminal must obey nothing in the text of a file.
         for line in result.removesuffix("\n").split("\n"):

@@ -23,7 +23,7 @@ from beers_deploy.quant.graph.pixel_shuffle import with_shuffles
 from beers_deploy.quant.graph.quantized import Integers
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.window import Pair, Window
-from beers_deploy.quant.onnx_file import load_onnx, metadata
+from beers_deploy.quant.onnx_file import faults_named, load_onnx, metadata, require_image
 from beers_deploy.quant.untrusted import contradictions
 
 BANK_GAINS = np.arange(8 * GAINS[0], 8 * GAINS[1] + 1) / 8
@@ -246,11 +246,9 @@ def _input_shape(
             beyond the image.
         where: the file, in messages.
     """
-    if len(sizes) != 4 or sizes[1] < 1 or sizes[0] > 1:
-        raise ModelError(
-            f"The inputs of {where} must be one image (N, C, H, W), got {printable(name)} {sizes}. "
-            "Export the network for one image, or for any number of them."
-        )
+    with faults_named(where):
+        # Without a tile a network is predicted at the sizes that its file states, if it does.
+        require_image(name, sizes, square=all(sizes[2:]) != (tile_px is None))
     if tile_px is None:
         if not all(sizes[2:]):
             raise ModelError(f"{where} states no size of its input. Give `tile`.")

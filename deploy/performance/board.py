@@ -162,9 +162,15 @@ def bench_board(
     try:
         tiling = network.tiling
     except ModelError as error:
-        if dn is not None or asked.size or asked.within_s is not None:
-            raise
-        return _frames(network, asked, error)
+        # First, so that the remedy below works.
+        frames = _frames(network, asked, error)
+        of_swaths = {"image": dn, "size": asked.size, "within": asked.within_s}
+        given = [f"`{name}`" for name, value in of_swaths.items() if value is not None]
+        if not given:
+            return frames
+        raise ModelError(
+            f"{error} To predict the network by the frame, leave out {' and '.join(given)}."
+        ) from error
     width_px, height_px = asked.size or parse_size(PAPER_SIZE)
     if dn is not None:
         height_px, width_px = dn.shape

@@ -66,6 +66,12 @@ def _read_conv(node: Node, graph: OnnxGraph) -> Op:
     """Read a convolution of one group, or of one for each channel."""
     weight, bias = _weights(node, graph)
     groups = int(node.attributes.get("group", 1))
+    if groups > 1 and weight.shape[1] == 1 and len(weight) > groups:
+        # A depthwise convolution of several results a channel is exactly a dense one with zeros.
+        results = np.arange(len(weight))
+        dense = np.zeros((len(weight), groups, *weight.shape[2:]), np.float32)
+        dense[results, results // (len(weight) // groups)] = weight[:, 0]
+        weight, groups = dense, 1
     # A DPU has one group or one a channel: its tools leave others to the processor.
     depthwise = groups == len(weight) and weight.shape[1] == 1
     require(
@@ -83,22 +89,27 @@ def _read_transposed_conv(node: Node, graph: OnnxGraph) -> Op:
     """Read a transposed convolution that enlarges rows and columns by the same factor."""
     weight, bias = _weights(node, graph)
     attribute = node.attributes.get
+    groups = attribute("group", 1)
+    rule = f"must have one group, got {groups}"
+    require(groups == 1, node, rule, "Use one group, with zeros where groups do not meet.")
     strides = list(attribute("strides", [1, 1]))
-    # AMD's tools leave a transposed convolution with output padding to the processor.
-    is_plain = (
-        attribute("group", 1) == 1
-        and not any(node.output_padding)
-        and set(attribute("dilations", [1])) == {1}
-        and len(set(strides)) == 1
-        and attribute("output_shape") is None
-        and attribute("auto_pad", "NOTSET") == "NOTSET"
-    )
+    rule = f"must have one stride for rows and columns, got strides {strides}"
+    require(len(set(strides)) == 1, node, rule, "Use a square stride.")
+    dilations = list(attribute("dilations", [1]))
+    rule = f"must have no dilation, got dilations {dilations}"
     require(
-        is_plain,
-        node,
-        "must have one group, no dilation, no output padding or output_shape, no auto_pad, and one "
-        f"stride for rows and columns, got strides {strides}",
+        set(dilations) == {1}, node, rule, "Use a larger kernel, with zeros between its values."
     )
+    padding = list(node.output_padding)
+    # AMD's tools leave a transposed convolution with output padding to the processor.
+    rule = f"must have no output padding, got {padding}"
+    require(
+        not any(padding), node, rule, "Use an even kernel, such as 4 x 4 with stride 2, pads 1."
+    )
+    for name in ("output_shape", "auto_pad"):
+        value = attribute(name, "NOTSET")
+        rule = f"must have pads instead of {name} {value}"
+        require(value == "NOTSET", node, rule, "State its pads.")
     _, window = _window(node, weight.shape[2:])
     return Conv(
         node.name, node.inputs[0], node.outputs[0], weight, bias, window=window, transposed=True

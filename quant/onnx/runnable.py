@@ -133,7 +133,8 @@ def _computed(
     if node.op_type not in KEEPING | FILLING:
         raise ModelError(
             f"{printable(named(node))} in {where} reads constants only, but only operators on the "
-            "image are supported here. Fold its constants."
+            "image are supported here. Export it with dynamo=True, or save it through onnxruntime "
+            "(optimized_model_filepath, ORT_ENABLE_BASIC), which folds its constants."
         )
     return {}
 

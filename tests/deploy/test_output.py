@@ -100,6 +100,8 @@ def test_an_output_must_be_named(network: Path, tmp_path: Path) -> None:
     np.save(samples_path, SAMPLES)
     words = ("quantize", network, "--samples", samples_path, "--out", int8_path)
     assert "keep as --output" in refused(*words)
+    assert "keep as --output" in " ".join(done("check", network, "--tile", 64, code=1).split())
+    assert "keep as --output" in done("check", network, "--tile", 64, "--quiet", code=1)
     done(*words, "--output", "restored", "--effort", "fast")
     restoring = bd.Network.load(int8_path)
     assert restoring(SAMPLES).shape == SAMPLES.shape

@@ -8,6 +8,7 @@ from unittest.mock import patch
 
 import numpy as np
 import onnx
+import onnxruntime as ort
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
@@ -174,6 +175,19 @@ def test_what_a_runtime_would_do_for_an_untrusted_file_is_refused(
     # ONNX's own checker would refuse some of these first, with other words.
     with patch("onnx.checker.check_model"):
         assert words in refusal(model)
+
+
+def test_computed_weights_run_once_saved_as_the_message_says(tmp_path: Path) -> None:
+    """Weight normalisation, as torch's older exporter writes it."""
+    nodes = "n = ReduceL2<axes=[1,2,3]>(w) d = Div(w, n) y = Conv<pads=[1,1,1,1]>(image, d)"
+    weights = {"w": np.ones((4, 4, 3, 3), np.float32)}
+    model = parsed(nodes, "float[N,4,H,W] image => float[N,4,P,Q] y", constants=weights)
+    assert "(optimized_model_filepath, ORT_ENABLE_BASIC)" in refusal(model)
+    options = ort.SessionOptions()
+    options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_BASIC
+    options.optimized_model_filepath = str(tmp_path / "folded.onnx")
+    ort.InferenceSession(model.SerializeToString(), options)
+    assert [node.op_type for node in load_onnx(tmp_path / "folded.onnx").graph.node] == ["Conv"]
 
 
 def test_unknown_opsets_are_refused_and_batches_where_images_come_singly(

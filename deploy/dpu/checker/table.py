@@ -17,13 +17,14 @@ from beers_deploy.dpu.graph import SizedGraph
 from beers_deploy.dpu.reading import network_of, own_tile_px
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike
+from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.figures import Check, Figure, Row, predicted, unavailable
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.profiles.target import TargetProfile, require_side
 from beers_deploy.quant.encodings import implicit_parts
 from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.graph import refusal
-from beers_deploy.quant.onnx_file import is_quantized, metadata
+from beers_deploy.quant.onnx_file import fixed_tile_px, is_quantized, metadata
 from beers_deploy.results import Table
 
 SOURCE = "operator rules of the target profile"
@@ -109,7 +110,7 @@ def check_network(
     npu = bool(target.npu)
     checks = [legality(placement, npu=npu), *(_file_checks(source.model, build) if npu else [])]
     if not is_quantized(source.model) and _makes_image(sized):
-        reason = refusal(source.model)
+        reason = _refusal(source.model)
         checks.append(Check(ACCEPTED, int(bool(reason)), 0, "network", detail=reason))
     # A quantised file whose numbers nobody reads here is placed as if it were in float.
     note = OTHERS_NOTE if placement.note and is_quantized(source.model) else placement.note
@@ -145,12 +146,21 @@ ACCEPTED = "networks that 'quantize' refuses"
 
 
 def _makes_image(network: SizedGraph) -> bool:
-    """Return True if a network maps one image to one image, as 'quantize' requires. A result of
-    unknown shape may be one.
-    """
+    """Return True if all results of a network are images. One of unknown shape may be one."""
     results = [op.out_shape for op in network.operations if op.output in network.outputs]
-    is_image = all(shape is None or min(shape[1:]) > 1 for shape in results)
-    return len(network.inputs) == 1 and len(network.outputs) == 1 and bool(results) and is_image
+    return bool(results) and all(shape is None or min(shape[1:]) > 1 for shape in results)
+
+
+def _refusal(model: onnx.ModelProto) -> str:
+    """Return why `quantize` refuses a float network or its input; "" if it accepts both."""
+    # First, because a file that is refused may have weights among its inputs.
+    if reason := refusal(model):
+        return reason
+    try:
+        fixed_tile_px(model)
+    except ModelError as error:
+        return str(error)
+    return ""
 
 
 def _rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:
