@@ -21,6 +21,7 @@ from beers_deploy.performance.swath import predict_network, swath_latency
 from beers_deploy.profiles.errors import BeersError, ImageError
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
 from beers_deploy.profiles.target import TargetProfile
+from beers_deploy.restoration.detectors.fault_list import FOUND
 from beers_deploy.restoration.detectors.look import warn_of_detectors
 from beers_deploy.restoration.plan import Plan, plan_for
 from beers_deploy.restoration.prepare import NetworkPipeline
@@ -58,7 +59,7 @@ def preview_row(
         check = SensorCheck()
         # Where full scale is open, no pixel counts as saturated.
         saturation = scale.value if isinstance(scale, FullScale) else math.inf
-        detectors = warn_of_detectors(source, saturation)
+        detectors = warn_of_detectors(source, saturation, reading.fix_detectors != FOUND)
         if isinstance(scale, FullScale):
             check = checked_sensor(source, reading.sensors, scale.value, str(image), reading.strict)
     plan = plan_for(network, raster.shape, pipeline.tiles)

@@ -211,7 +211,7 @@ def warn_of_detectors(
     Args:
         source: the image.
         full_scale: the pixel value at and above which a pixel is saturated and does not count.
-        advise_fix: False if the run has replaced the faults that it found, so that no warning
+        advise_fix: False if the run replaces the faults that it finds, so that no warning
             recommends it.
 
     Returns:
