@@ -24,7 +24,8 @@ import onnx
 from scipy.stats import spearmanr
 
 from beers_deploy.model.family import SensorFamily
-from beers_deploy.model.interval import BORDER_PX, PixelInterval, Sample, calibrated
+from beers_deploy.model.interval import PixelInterval
+from beers_deploy.model.interval_calibration import BORDER_PX, Sample, calibrated
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.levels import LEVELS, Level
 from beers_deploy.model.raster.images import list_images, site_of
@@ -52,9 +53,14 @@ REFERENCE = Sensor.load("pleiades-reference").nominal()
 FAMILY = SensorFamily(LIKE.nominal(), other_curves=0.3)
 RECIPES = SHIPPED.parent / "recipes"
 
-FITTED = 4
+FITTED = 8
 HELD_OUT = 20
 """Acquisitions of a place that networks were trained on, and of one that was held out of that."""
+DARKEST = 0.05
+"""The least radiance that half of the fitted acquisitions are dimmed to, so that the half-widths
+follow the light. The held-out ones have full radiance: with dimmed ones among them, the interval
+would cover less than 85 % at one of the places.
+"""
 CROP_PX = 160
 """The side of the window of a scene that is acquired, in pixels of the sensor."""
 MIN_SIDE_PX = 2 * BORDER_PX + 64
@@ -148,7 +154,9 @@ def training_images(folders: Iterable[Path]) -> tuple[list[Acquired], list[Acqui
         count = HELD_OUT if is_held_out else FITTED
         for k in range(count):
             path = paths[k * len(paths) // count]
-            image = acquired(path, FAMILY.draw, (number, k), CROP_PX)
+            dimmed = k % 2 == 1 and not is_held_out
+            radiance = DARKEST ** np.random.default_rng((number, k)).random() if dimmed else 1.0
+            image = acquired(path, FAMILY.draw, (number, k), CROP_PX, radiance)
             if image is not None:
                 parts[is_held_out].append(image)
     return parts

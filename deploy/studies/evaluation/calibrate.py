@@ -7,7 +7,8 @@ from typing import Any
 
 import onnx
 
-from beers_deploy.model.interval import PixelInterval, Sample, calibrated
+from beers_deploy.model.interval import PixelInterval
+from beers_deploy.model.interval_calibration import Sample, calibrated
 from beers_deploy.model.io.tensors import read_tensors, write_tensors
 from beers_deploy.model.levels import INTERVAL
 from beers_deploy.profiles.errors import ImageError, OptionError

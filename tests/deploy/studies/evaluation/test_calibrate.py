@@ -8,7 +8,7 @@ import onnx
 import pytest
 
 import beers_deploy as bd
-from beers_deploy.model.interval import BORDER_PX
+from beers_deploy.model.interval_calibration import BORDER_PX
 from beers_deploy.model.io.tensors import read_tensors
 from beers_deploy.model.shipped import shipped_weights
 from beers_deploy.profiles.errors import ImageError, OptionError
