@@ -8,7 +8,9 @@ from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.graph import CORRECTION, PLANES, Add, Mul, Op, Pointwise
 
 IN_PLACE = (Add, Mul, Pointwise)
-"""Operations that read of each input only the value at the position that they write."""
+"""Operations that read of each input of the result's size only the value at the position that they
+write. A product may read a smaller one too, a factor for each channel.
+"""
 
 
 def share_buffers(core: IntCore, sizes: Mapping[str, int]) -> tuple[dict[str, int], list[int]]:
@@ -35,7 +37,9 @@ def share_buffers(core: IntCore, sizes: Mapping[str, int]) -> tuple[dict[str, in
     free = set[int]()
     for k, op in steps:
         ending = {number[name] for name in op.inputs if last_use[name] == k}
-        chosen = _choose(op, ending, free, buffers, sizes[op.output])
+        size = sizes[op.output]
+        over = {number[name] for name in op.inputs if last_use[name] == k and sizes[name] == size}
+        chosen = _choose(op, over, free, buffers, size)
         number[op.output] = chosen
         free |= ending | {chosen}
         # A result that nothing reads leaves its buffer free at once.
@@ -44,9 +48,7 @@ def share_buffers(core: IntCore, sizes: Mapping[str, int]) -> tuple[dict[str, in
     return number, buffers
 
 
-def _choose(
-    op: IntConv | Op, ending: set[int], free: set[int], buffers: list[int], size: int
-) -> int:
+def _choose(op: IntConv | Op, over: set[int], free: set[int], buffers: list[int], size: int) -> int:
     """Return the number of the buffer for a result, and make the buffer large enough.
 
     1. An operation that works value by value writes over an input that nothing reads later.
@@ -56,13 +58,13 @@ def _choose(
 
     Args:
         op: the operation that writes the result.
-        ending: buffers of its inputs that no later operation reads.
+        over: buffers of its inputs of that size that no later operation reads.
         free: buffers that hold no tensor which is read from here on.
         buffers: the sizes of all buffers in bytes, which are extended in place.
         size: the size of the result in bytes.
     """
-    if isinstance(op, IN_PLACE) and ending:
-        return min(ending)
+    if isinstance(op, IN_PLACE) and over:
+        return min(over)
     if not free:
         buffers.append(size)
         return len(buffers) - 1

@@ -32,6 +32,7 @@ KINDS = (
     "transposed",
     "add",
     "mul",
+    "gate",
     "concat",
     "maximum",
     "mean",
@@ -172,6 +173,15 @@ class CoreDrawer:
         finest = sum(self.frac_bits[name] for name in pair)
         mul = Mul(self.name(), pair, self.result())
         self.append(mul, self.shapes[source], finest - self.number(0, 10))
+
+    def _gate(self, source: str) -> None:
+        """Append a product with a factor for each channel: the mean over the map."""
+        kernel = self.shapes[source][1:]
+        mean = AveragePool(self.name(), source, self.result(), kernel, Window())
+        self.append(mean, (self.shapes[source][0], 1, 1), self.frac_bits[source])
+        pair = self.draw(st.permutations([source, mean.output]))
+        mul = Mul(self.name(), tuple(pair), self.result())
+        self.append(mul, self.shapes[source], 2 * self.frac_bits[source] - self.number(0, 10))
 
     def _concat(self, source: str) -> None:
         """Append the channels of all tensors that have the same size and scale."""
