@@ -27,17 +27,16 @@ from beers_deploy.comparison import Comparison
 from beers_deploy.dpu.board import device_of
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.checker.table import legality
-from beers_deploy.dpu.reading import network_of
+from beers_deploy.dpu.reading import network_of, usual_tile_px
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import OptionError, encodable, printable, reason_of
 from beers_deploy.profiles.figures import Check
-from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.profiles.toml import read_json
 from beers_deploy.quant.float_parts import float_note
 from beers_deploy.quant.gate import GateResult, unfit_reference
 from beers_deploy.quant.limits import Limits, judge
-from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px
+from beers_deploy.quant.onnx_file import faults_named
 from beers_deploy.quant.samples.own import OwnSamples
 from beers_deploy.quant.structure import ENCODING, structure_checks
 from beers_deploy.results import SCHEMA_PATH, Input, Table
@@ -366,7 +365,7 @@ def file_checks(
     if not (target.configurations or target.npu):
         return checks
     with faults_named(int8.label):
-        graph = network_of(int8.model, fixed_tile_px(int8.model) or TILE_PX, int8.name)
+        graph = network_of(int8.model, usual_tile_px(int8.model), int8.name)
     return [legality(place(graph, device_of(target)), npu=bool(target.npu)), *checks]
 
 

@@ -18,6 +18,7 @@ from beers_deploy.dpu.graph import Operation, SizedGraph
 from beers_deploy.dpu.shapes import Kind, Shape, kind_of, out_shape
 from beers_deploy.model.bank import GAINS, LARGEST, WIDE
 from beers_deploy.profiles.errors import ModelError, printable
+from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.quant.encodings import BORDER_PX, PLACE_PX, as_on_board
 from beers_deploy.quant.graph.pixel_shuffle import with_shuffles
 from beers_deploy.quant.graph.quantized import Integers
@@ -69,6 +70,15 @@ def own_tile_px(model: onnx.ModelProto) -> int | None:
         return None
     place_px, border_px = _places(model)
     return side * place_px - 2 * border_px
+
+
+def usual_tile_px(model: onnx.ModelProto) -> int:
+    """Return the side in pixels of the image that a network is fixed to; else the smallest side of
+    at least TILE_PX whose pixels the host can move into channels.
+    """
+    place_px, border_px = _places(as_on_board(model))
+    whole_px = place_px * -(-(TILE_PX + 2 * border_px) // place_px)
+    return own_tile_px(model) or whole_px - 2 * border_px
 
 
 def _places(model: onnx.ModelProto) -> tuple[int, int]:

@@ -14,12 +14,11 @@ from beers_deploy.dpu.checker.finding import Finding
 from beers_deploy.dpu.checker.placement import Cut, PlacedNode, Placement, place
 from beers_deploy.dpu.checker.remarks import is_island, remarks_on
 from beers_deploy.dpu.graph import SizedGraph
-from beers_deploy.dpu.reading import network_of, own_tile_px
+from beers_deploy.dpu.reading import network_of, usual_tile_px
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.figures import Check, Figure, Row, predicted, unavailable
-from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.profiles.target import TargetProfile, require_side
 from beers_deploy.quant.encodings import implicit_parts
 from beers_deploy.quant.encodings.description import KEY
@@ -87,7 +86,7 @@ def check_network(
         target: a board with a DPU or an NPU.
         dpu: the name of the DPU's configuration; the board's default if None.
         tile: side of the square image in pixels; if None, the size that the network is fixed to,
-            or 640.
+            or 640 or a little more.
         output: the name of the only output to check; all outputs if None.
 
     Returns:
@@ -102,7 +101,7 @@ def check_network(
     if output is not None:
         source = source.with_output(output)
     build = device_of(target, dpu)
-    tile_px = own_tile_px(source.model) or TILE_PX
+    tile_px = usual_tile_px(source.model)
     if tile is not None:
         tile_px = require_side(tile)
     sized = network_of(source.model, tile_px, source.label)

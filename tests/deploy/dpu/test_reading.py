@@ -3,11 +3,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from onnx import numpy_helper
+from onnx.helper import set_model_props
 
-from beers_deploy.dpu.reading import own_tile_px, read_network
+from beers_deploy.dpu.reading import own_tile_px, read_network, usual_tile_px
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.encodings import PLACE_PX, board_model
-from beers_deploy.quant.onnx_file import save_onnx
+from beers_deploy.quant.encodings import BORDER_PX, PLACE_PX, board_model
+from beers_deploy.quant.onnx_file import metadata, save_onnx
 from tests.deploy.dpu.graphs import Sketch, board_convbeers
 from tests.quant.tiling.small_networks import quantized_half_resolution
 
@@ -83,6 +84,20 @@ def test_a_core_at_half_resolution_that_is_fixed_to_a_tile_is_fixed_to_half_of_i
     save_onnx(fixed, tmp_path / "fixed.onnx")
     with pytest.raises(ModelError, match=r"fixed to 64 x 64 pixels.*Give `tile` 64"):
         read_network(tmp_path / "fixed.onnx", 66)
+
+
+@pytest.mark.parametrize(("place_px", "border_px"), [(1, 0), (3, 0), (3, 2), (7, 5)])
+def test_the_usual_tile_has_whole_places(place_px: int, border_px: int, tmp_path: Path) -> None:
+    """It has at least 640 pixels, also where 640 are no whole places, and no place too many."""
+    model = board_model(quantized_half_resolution().core, {})
+    numbers = {PLACE_PX: str(place_px), BORDER_PX: str(border_px)}
+    set_model_props(model, {**metadata(model), **numbers})
+    tile_px = usual_tile_px(model)
+    assert 640 <= tile_px < 640 + place_px
+    save_onnx(model, tmp_path / "core.onnx")
+    assert read_network(tmp_path / "core.onnx", tile_px).operations
+    fixed = board_model(quantized_half_resolution().core, {}, 64)
+    assert usual_tile_px(fixed) == 64
 
 
 @pytest.mark.parametrize("text", ["0", "half", "1000000"])
