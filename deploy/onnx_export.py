@@ -21,7 +21,11 @@ from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.c_code import c_program
 from beers_deploy.quant.encodings import host_model, read_core, require_undamaged, required_tile
 from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
-from beers_deploy.quant.sensor_bank.conditioned import delta_of_file, required_conditioned_core
+from beers_deploy.quant.sensor_bank.conditioned import (
+    conditioned_core,
+    delta_of_file,
+    required_conditioned_core,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -70,12 +74,13 @@ def export_float(path: Path, out: Path, sensor: SensorLike | None, tile: int | N
     )
 
 
-def conditioned_int8(path: Path, sensor: SensorLike, delta: Path | None) -> onnx.ModelProto:
-    """Read an INT8 file and condition it on another sensor.
+def conditioned_int8(path: Path, sensor: SensorLike | None, delta: Path | None) -> onnx.ModelProto:
+    """Read an INT8 file, and condition it on another sensor if it serves every sensor.
 
     Args:
-        path: the INT8 file, which `quantize` made from weights that serve every sensor.
-        sensor: the new sensor. It is ignored if there is a delta.
+        path: the INT8 file, which `quantize` made.
+        sensor: the new sensor; None for the default, or to read the file of one sensor as it is.
+            It is ignored if there is a delta.
         delta: a file written by `export --delta` with the filters and biases of its sensor, to use
             in place of `sensor`; None for none.
 
@@ -89,7 +94,9 @@ def conditioned_int8(path: Path, sensor: SensorLike, delta: Path | None) -> onnx
     model = load_onnx(path)
     if delta is not None:
         return int8_for_delta(model, delta)
-    profile = Sensor.load(sensor)
+    if sensor is None and conditioned_core(model) is None:
+        return model
+    profile = Sensor.load(sensor or SENSOR)
     warn_outside(profile, required_conditioned_core(model).kernels)
     return int8_for_sensor(model, profile)
 

@@ -40,7 +40,7 @@ def export(
     Args:
         out: ONNX file to write.
         network: a shipped name, also with -int8; weights (.safetensors); or an INT8 file that
-            'quantize' made of weights of 'train --conditioned'.
+            'quantize' made.
         sensor: sensor of the network: name, .toml file or blind; pleiades-degraded if none.
         tile: side in pixels of the one tile that the input is fixed to, such as 640.
         board_file: also write the core of an INT8 network in the board's encoding: QDQ ONNX, of an
@@ -99,7 +99,7 @@ def export(
     if path.suffix != ".onnx":
         export_float(path, Path(out), sensor, tile)
         return Path(out)
-    model = conditioned_int8(path, sensor or SENSOR, path_or_none(apply))
+    model = conditioned_int8(path, sensor, path_or_none(apply))
     export_int8(model, Path(out), tile, core, board, c_file)
     for exposure, file in deltas.items():
         save_delta(model, sensor or SENSOR, exposure, file)

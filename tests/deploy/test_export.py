@@ -25,6 +25,7 @@ from beers_deploy.quant.tiling.receptive_field import tiling_of
 from tests.deploy.command_line import done, refused
 from tests.model.networks import behind_a_bank, plain, radius_px
 from tests.profiles.own_sensor import own_sensor
+from tests.quant.tiling.small_networks import quantized_half_resolution
 
 
 @pytest.fixture(scope="module")
@@ -174,3 +175,12 @@ def test_a_core_is_written_as_c_for_a_tile(tmp_path: Path) -> None:
     assert f"int8.onnx, SHA-256 {digest}" in text
     assert "void run(const int8_t *in, int8_t *out)" in text
     assert "another output" in refused(f"{words.replace('net.c', 'int8.onnx')} --tile 32")
+
+
+def test_the_core_of_a_user_s_network_is_written_as_it_is(tmp_path: Path) -> None:
+    """It is of one sensor, so that naming another is refused."""
+    save_onnx(quantized_half_resolution().host, tmp_path / "own.onnx")
+    words = f"export --network {tmp_path}/own.onnx --out {tmp_path}/tile.onnx --tile 32"
+    done(f"{words} --c {tmp_path}/net.c")
+    assert "void run(const int8_t *in, int8_t *out)" in (tmp_path / "net.c").read_text()
+    assert "cannot be conditioned" in refused(f"{words} --sensor pleiades-degraded")
