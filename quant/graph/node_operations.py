@@ -71,7 +71,8 @@ def _read_conv(node: Node, graph: OnnxGraph) -> Op:
         results = np.arange(len(weight))
         dense = np.zeros((len(weight), groups, *weight.shape[2:]), np.float32)
         dense[results, results // (len(weight) // groups)] = weight[:, 0]
-        weight, groups = dense, 1
+        weight = dense
+        groups = 1
     # A DPU has one group or one a channel: its tools leave others to the processor.
     depthwise = groups == len(weight) and weight.shape[1] == 1
     require(

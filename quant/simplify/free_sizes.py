@@ -5,7 +5,7 @@ them.
 2. Write a Resize to a size as one by factors, the pixel unshuffle of one channel as SpaceToDepth,
    and that of several channels within the network, and a shuffle of channels, as a convolution.
    Remove a Pad by nothing, a Slice of the whole map, and an Expand that arithmetic does anyway. Let
-   a convolution write a map of one number per channel, such as a noise level.
+   a convolution repeat a channel, and write a map of one number per channel, such as a noise level.
 3. Do both for two sizes. If the networks are equal, the size has no effect, and theirs is the
    network of every image whose sides are multiples of `MULTIPLE_PX`. Otherwise the network is not
    changed.
@@ -133,6 +133,8 @@ def _sized(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> l
         attributes = {k: v for k, v in node.attributes.items() if k != "keep_aspect_ratio_policy"}
         inputs = [source, "", scales]
         return [Node.new("Resize", inputs, node.outputs[0], node.name, **attributes)]
+    if node.op_type == "Expand":
+        return _expanded(graph, node, sizes)
     if node.op_type == "Concat":
         return _with_written_maps(graph, node, before, after)
     keeps_all = (
@@ -141,18 +143,38 @@ def _sized(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> l
         and all(step == 1 for step in graph.numbers(node, 4, "steps") or ())
     )
     adds_nothing = node.op_type == "Pad" and graph.numbers(node, 1, "pads") == [0] * 8
-    expands_in_vain = node.op_type == "Expand" and all(
-        reader.op_type in ("Add", "Mul", "Sub") and after in _others(reader, node, sizes)
-        for reader in graph.readers[node.outputs[0]]
-    )
-    if keeps_all or adds_nothing or expands_in_vain or node.op_type in RESHAPING:
+    if keeps_all or adds_nothing or node.op_type in RESHAPING:
         return [Node.new("Identity", [source], node.outputs[0], node.name)]
     return None
 
 
-def _others(reader: Node, writer: Node, sizes: dict[str, tuple[int, ...]]) -> list[tuple[int, ...]]:
-    """Return the sizes of what a node reads besides the result of another node."""
-    return [sizes.get(name, ()) for name in reader.inputs if name != writer.outputs[0]]
+def _expanded(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> list[Node] | None:
+    """Return nothing but another name for an Expand without effect, or the convolution that repeats
+    a map of one channel; None for other Expands.
+    """
+    source = node.inputs[0]
+    result = node.outputs[0]
+    before = sizes[source]
+    after = sizes[result]
+    if before == after or _is_broadcast_anyway(graph, node, sizes):
+        return [Node.new("Identity", [source], result, node.name)]
+    if before[1] > 1 or before[2:] != after[2:]:
+        return None
+    return [graph.convolution(source, result, node.name, np.ones((after[1], 1, 1, 1)))]
+
+
+def _is_broadcast_anyway(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> bool:
+    """Return True if all readers of an Expand are arithmetic that broadcasts to the same size."""
+    result = node.outputs[0]
+    for reader in graph.readers[result]:
+        others = [name for name in reader.inputs if name != result]
+        # What another Expand enlarges may be small itself.
+        is_large = len(others) == 1 and sizes.get(others[0]) == sizes[result]
+        writer = graph.writers.get(others[0]) if is_large else node
+        is_expanded = writer is not None and writer.op_type == "Expand"
+        if reader.op_type not in ("Add", "Mul", "Sub") or is_expanded:
+            return False
+    return result not in graph.outputs
 
 
 def _with_written_maps(

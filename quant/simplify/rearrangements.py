@@ -55,12 +55,13 @@ def rearranged(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
     split = sizes.get(moved.inputs[0], ())
     ends = sizes.get(source, ()), sizes[node.outputs[0]]
     perm = moved.attributes.get("perm")
+    weight = None
+    stride = 1
     if perm == SHUFFLE and len(split) == 5:
-        weight, stride = _channel_shuffle(split, ends), 1
+        weight = _channel_shuffle(split, ends)
     elif perm == UNSHUFFLE and len(split) == 6:
-        weight, stride = _unshuffle(split, ends), split[3]
-    else:
-        return None
+        weight = _unshuffle(split, ends)
+        stride = split[3]
     if weight is None:
         return None
     if stride > 1 and weight.shape[1] == 1:

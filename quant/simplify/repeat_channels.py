@@ -1,17 +1,18 @@
 """Repeat channels by convolutions of one pixel, where a network repeats them or leaves it to ONNX.
 
-A DPU adds and multiplies maps of one number of channels. A map of one channel that gates several is
+A DPU adds and multiplies maps of one number of channels. A map of one channel that meets several is
 repeated first, as a Tile along the channels does. Both are exact.
 """
 
 import numpy as np
+import onnx
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
-from beers_deploy.quant.simplify.standard_operators import Shapes, channels_in
+from beers_deploy.quant.simplify.standard_operators import Shapes, channels_in, float_shapes
 
 
 def repeat_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Let a convolution repeat the channels of a map that a Tile, an Add or a Mul repeats.
+    """Let a convolution repeat the channels of a map that a Tile or arithmetic repeats.
 
     The image is left as it is: the host adds it to each channel of a result.
 
@@ -21,9 +22,10 @@ def repeat_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] 
         node: any node.
 
     Returns:
-        The convolution, and the Add or Mul; None if the node repeats no channels.
+        The convolution, and the arithmetic; None if the node repeats no channels.
     """
-    source, result = node.inputs[0], node.outputs[0]
+    source = node.inputs[0]
+    result = node.outputs[0]
     channels = channels_in(shapes, source)
     if node.op_type == "Tile":
         repeats = graph.value(node, 1)
@@ -31,13 +33,32 @@ def repeat_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] 
             return None
         weight = np.tile(np.eye(channels), (int(repeats[1]), 1))[:, :, None, None]
         return [graph.convolution(source, result, node.name, weight)]
-    if node.op_type not in ("Add", "Mul") or not graph.constants.keys().isdisjoint(node.inputs):
+    narrow = _narrow_input(shapes, graph, node)
+    if narrow is None:
+        return None
+    channels = max(channels_in(shapes, name) for name in node.inputs)
+    name = f"{result}.repeated"
+    repeated = graph.convolution(narrow, name, name, np.ones((channels, 1, 1, 1)))
+    node.inputs = tuple(name if each == narrow else each for each in node.inputs)
+    return [repeated, node]
+
+
+def broadcasts_channels(model: onnx.ModelProto) -> bool:
+    """Return True if a network adds or multiplies maps of one channel and of several.
+
+    Args:
+        model: a float network of few kinds of operators, whose channels ONNX can infer.
+    """
+    graph = OnnxGraph(model)
+    shapes = float_shapes(graph)
+    return any(_narrow_input(shapes, graph, node) is not None for node in graph.nodes)
+
+
+def _narrow_input(shapes: Shapes, graph: OnnxGraph, node: Node) -> str | None:
+    """Return the map of one channel that an Add, Mul or Sub repeats; None if there is none."""
+    is_of_maps = graph.constants.keys().isdisjoint(node.inputs)
+    if node.op_type not in ("Add", "Mul", "Sub") or not is_of_maps:
         return None
     widths = [channels_in(shapes, name) for name in node.inputs]
     narrow = node.inputs[int(widths[0] > widths[1])]
-    if min(widths) != 1 or max(widths) == 1 or narrow in graph.inputs:
-        return None
-    name = f"{result}.repeated"
-    repeated = graph.convolution(narrow, name, name, np.ones((max(widths), 1, 1, 1)))
-    node.inputs = tuple(name if each == narrow else each for each in node.inputs)
-    return [repeated, node]
+    return narrow if min(widths) == 1 < max(widths) and narrow not in graph.inputs else None

@@ -62,7 +62,7 @@ from beers_deploy.quant.simplify.fully_connected import ConnectByConvolutions
 from beers_deploy.quant.simplify.image_residual import add_to_image, clip_last
 from beers_deploy.quant.simplify.large_kernels import is_large, split_large_kernel
 from beers_deploy.quant.simplify.missing_border import with_missing_border
-from beers_deploy.quant.simplify.repeat_channels import repeat_channels
+from beers_deploy.quant.simplify.repeat_channels import broadcasts_channels, repeat_channels
 from beers_deploy.quant.simplify.spelled_activations import (
     halve_before_gelu,
     join_hard_swish,
@@ -148,12 +148,14 @@ def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 def _run_passes(model: onnx.ModelProto) -> None:
     """Rewrite the nodes of a network in place, without renaming its inputs and outputs."""
     graph = OnnxGraph(model)
+    graph.rewrite(clip_last)
+    # A Clip that was replaced would count as a reader.
+    graph.save()
     for rewriting in (
         split_sums,
         join_relu,
         join_hard_swish,
         halve_before_gelu,
-        clip_last,
         add_to_image,
         add_negated,
         fold_behind,
@@ -164,6 +166,7 @@ def _run_passes(model: onnx.ModelProto) -> None:
     shapes = float_shapes(graph)
     fold_in_front(graph, shapes)
     for with_shapes in (
+        repeat_channels,
         drop_cast,
         pool_mean,
         convolve_normalisation,
@@ -172,7 +175,6 @@ def _run_passes(model: onnx.ModelProto) -> None:
         unshuffle_slices,
         split_channels,
         convolve_crop,
-        repeat_channels,
     ):
         graph.rewrite(partial(with_shapes, shapes))
     # A normalisation that has become a convolution takes in what stands around it.
@@ -184,7 +186,7 @@ def _run_passes(model: onnx.ModelProto) -> None:
 
 def _is_plain(model: onnx.ModelProto) -> bool:
     weights = {tensor.name for tensor in model.graph.initializer}
-    return (
+    is_of_plain_operators = (
         opset_of(model) == OPSET
         and not any(
             tensor.data_type in OTHER_FLOATS or is_large(tuple(tensor.dims))
@@ -198,6 +200,7 @@ def _is_plain(model: onnx.ModelProto) -> bool:
             for node in model.graph.node
         )
     )
+    return is_of_plain_operators and not broadcasts_channels(model)
 
 
 def _to_float32(model: onnx.ModelProto) -> None:

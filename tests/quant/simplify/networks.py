@@ -160,6 +160,19 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         f"c = {SAME}(x, one) d = {SAME}(x, w) y = Mul(c, d)",
         {"Conv": 3, "Mul": 1},
     ),
+    "one channel less four": (
+        f"c = {SAME}(x, one) r = Relu(x) d = Sub(c, r) y = Mul(d, r)",
+        {"Conv": 3, "Relu": 1, "Add": 1, "Mul": 1},
+    ),
+    "one channel and four, and no more": (
+        f"c = {SAME}(x, one) d = {SAME}(x, w) y = Add(c, d)",
+        {"Conv": 3, "Add": 1},
+    ),
+    "added, clipped and scaled again": (
+        f"""m = Mul(x, six) n = Sub(m, half) c = {SAME}(n, w) a = Add(n, c) p = Add(a, half)
+        k = Clip(p, zero, six) y = Mul(k, six)""",
+        {"Mul": 2, "Sub": 1, "Conv": 1, "Add": 2, "Clip": 1},
+    ),
     "one channel four times": (
         f"c = {SAME}(x, one) t = Tile(c, four_channels) y = Mul(t, x)",
         {"Conv": 2, "Mul": 1},

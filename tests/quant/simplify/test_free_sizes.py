@@ -160,6 +160,28 @@ def test_sizes_are_gone_and_results_are_the_same(make: Callable[[], nn.Module]) 
     np.testing.assert_allclose(after, before, atol=1e-6)
 
 
+class Enlarged(nn.Module):
+    """Expands the channels of its result, of both factors, and of what is a result too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.body = nn.Conv2d(1, 1, 3, padding=1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Images (N, 1, H, W) to (N, 3, H, W)."""
+        wide = self.body(image).expand(-1, 3, -1, -1)
+        result: Tensor = wide * (1 - self.body(wide[:, :1])).expand_as(wide)
+        return result.expand(image.shape[0], 3, image.shape[2], image.shape[3])
+
+
+def test_an_expand_that_has_an_effect_keeps_it() -> None:
+    model = exported(Enlarged())
+    image = np.random.default_rng(2).uniform(0, 1, (1, 1, 22, 38)).astype(np.float32)
+    before = result_of(open_session(model), image)
+    after = result_of(open_session(simplify(model, "a.onnx")), image)
+    np.testing.assert_allclose(after, before, atol=1e-6)
+
+
 class Cropped(nn.Module):
     """Uses a tenth of its rows more than once, whatever their number."""
 
