@@ -143,7 +143,8 @@ class Conditions:
         Returns:
             An array of that shape for each exponent, or a number if it is the same for all pixels.
         """
-        m, n = np.array(self.blur), np.array(self.noise)
+        m = np.array(self.blur)
+        n = np.array(self.noise)
         d = np.log(detail)
         t = np.log(noise / self.middle_noise)
         return [d, m * d, n * d, t * d, m, n, t]
