@@ -5,7 +5,7 @@ to the normalised image and undo the normalisation behind the sum:
 
     c (correction + a x + b) + d = c correction + x    if c a = 1 and c b + d = 0
 
-1. A Clip whose result is scaled and shifted by positive constants becomes the last operation.
+1. A Clip whose result is scaled and shifted becomes the last operation.
 2. A sum whose scaling returns the image becomes a sum with the image.
 
 The host then adds the image in float, and INT8 holds the small correction alone. Of one small
@@ -43,13 +43,15 @@ def clip_last(graph: OnnxGraph, node: Node) -> list[Node] | None:
         return None
     limits = [graph.value(clip, place) for place in (1, 2)]
     has_limits = all(limit is not None and limit.size == 1 for limit in limits)
-    if not has_limits or affine.channels > 1 or affine.scale.item() <= 0:
+    if not has_limits or affine.channels > 1 or not affine.scale.all():
         return None
     name = node.outputs[0]
     scale = graph.add_constant(f"{name}.scale", affine.scale)
+    # A negative scale exchanges the two limits.
+    low, high = sorted((affine.scale * limit + affine.shift).item() for limit in limits)
     ends = [
-        graph.add_constant(f"{name}.{end}", (affine.scale * limit + affine.shift).reshape(()))
-        for end, limit in zip(("low", "high"), limits, strict=True)
+        graph.add_constant(f"{name}.low", np.array(low)),
+        graph.add_constant(f"{name}.high", np.array(high)),
     ]
     last = f"{name}.scaled"
     nodes = [Node.new("Mul", [clip.inputs[0], scale], last, last)]

@@ -156,8 +156,8 @@ def _run_passes(model: onnx.ModelProto) -> None:
         join_relu,
         join_hard_swish,
         halve_before_gelu,
-        add_to_image,
         add_negated,
+        add_to_image,
         fold_behind,
         split_large_kernel,
     ):

@@ -148,6 +148,15 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         p = Add(a, half) y = Div(p, image)""",
         {"Mul": 1, "Sub": 1, "Conv": 1, "Add": 1},
     ),
+    "taken from the image as it is normalised": (
+        f"""m = Mul(x, six) n = Sub(m, half) c = {SAME}(n, w) a = Sub(n, c)
+        p = Add(a, half) y = Div(p, six)""",
+        {"Mul": 1, "Sub": 1, "Conv": 1, "Add": 1},
+    ),
+    "clipped, and turned around": (
+        f"{CONV} a = Add(c, x) k = Clip(a, zero, half) y = Sub(three, k)",
+        {"Mul": 1, "Conv": 1, "Add": 2, "Clip": 1},
+    ),
     "added to the image as it is normalised, and left so": (
         f"m = Mul(x, six) n = Sub(m, half) c = {SAME}(n, w) a = Add(n, c) y = Add(a, half)",
         {"Mul": 1, "Sub": 1, "Conv": 1, "Add": 2},
