@@ -166,15 +166,17 @@ def _expanded(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -
 def _is_broadcast_anyway(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> bool:
     """Return True if all readers of an Expand are arithmetic that broadcasts to the same size."""
     result = node.outputs[0]
-    for reader in graph.readers[result]:
-        others = [name for name in reader.inputs if name != result]
-        # What another Expand enlarges may be small itself.
-        is_large = len(others) == 1 and sizes.get(others[0]) == sizes[result]
-        writer = graph.writers.get(others[0]) if is_large else node
-        is_expanded = writer is not None and writer.op_type == "Expand"
-        if reader.op_type not in ("Add", "Mul", "Sub") or is_expanded:
-            return False
-    return result not in graph.outputs
+    # What another Expand enlarges may be small itself, so it does not count.
+    large = {
+        name
+        for name, size in sizes.items()
+        if size == sizes[result]
+        and (name not in graph.writers or graph.writers[name].op_type != "Expand")
+    }
+    return result not in graph.outputs and all(
+        reader.op_type in ("Add", "Mul", "Sub") and not large.isdisjoint(reader.inputs)
+        for reader in graph.readers[result]
+    )
 
 
 def _with_written_maps(

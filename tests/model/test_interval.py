@@ -8,21 +8,13 @@ import numpy as np
 import pytest
 
 from beers_deploy.model.family import noise_over_full_scale
-from beers_deploy.model.interval import LEAST_DETAIL, MIDDLE_NOISE, Exponents, PixelInterval
+from beers_deploy.model.interval import LEAST_DETAIL, MIDDLE_NOISE, PixelInterval
 from beers_deploy.model.self_check import noise_variances
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import Sensor
+from tests.model.exponents import EXPONENTS
 
 SENSOR = Sensor.load("pleiades-degraded").nominal()
-EXPONENTS = Exponents(
-    detail=0.4,
-    detail_by_blur=-0.1,
-    detail_by_noise=0.02,
-    detail_by_light=0.05,
-    blur=-0.2,
-    noise=0.1,
-    light=0.15,
-)
 INTERVAL = PixelInterval(EXPONENTS, {50: 0.7, 90: 1.8}, 40)
 MAX_DN = float(SENSOR.max_dn)
 

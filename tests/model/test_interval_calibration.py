@@ -18,17 +18,9 @@ from beers_deploy.model.interval_calibration import (
 from beers_deploy.model.levels import LEVELS
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Sensor
+from tests.model.exponents import EXPONENTS
 
 SENSOR = Sensor.load("pleiades-degraded").nominal()
-EXPONENTS = Exponents(
-    detail=0.4,
-    detail_by_blur=-0.1,
-    detail_by_noise=0.02,
-    detail_by_light=0.05,
-    blur=-0.2,
-    noise=0.1,
-    light=0.15,
-)
 MAX_DN = float(SENSOR.max_dn)
 
 
