@@ -33,7 +33,8 @@ from beers_deploy.quant.encodings import board_model
 from beers_deploy.quant.graph import CORRECTION, PLANES
 from beers_deploy.quant.host_part import ZERO
 from beers_deploy.quant.integer.reference import run_core
-from beers_deploy.quant.onnx_file import any_size, fixed_tile_px, save_onnx
+from beers_deploy.quant.onnx.image_input import any_size, fixed_tile_px
+from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.quant.session import open_session, with_outputs
 
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]

@@ -21,7 +21,8 @@ import beers_deploy as bd
 from beers_deploy.network import Network
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings import host_model, read_core
-from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata
+from beers_deploy.quant.onnx.image_input import fixed_tile_px
+from beers_deploy.quant.onnx_file import load_onnx, metadata
 
 Change = Callable[[np.ndarray], np.ndarray]
 Numbers = Literal["weight", "bias"]

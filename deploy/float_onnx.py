@@ -19,7 +19,8 @@ from beers_deploy.model.levels import INTERVAL
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.quant.onnx_file import GraphWriter, image_info, load_onnx, make_model
+from beers_deploy.quant.onnx.image_input import image_info
+from beers_deploy.quant.onnx_file import GraphWriter, load_onnx, make_model
 
 if TYPE_CHECKING:
     from beers_deploy.model.convbeers import ConvBEERS

@@ -34,9 +34,9 @@ from beers_deploy.quant.encodings import CORE, board_model, read_core, vint8_mod
 from beers_deploy.quant.graph import require_one_image
 from beers_deploy.quant.input_range import FROM_SAMPLES, KEY, Ranges, in_words
 from beers_deploy.quant.onnx.external_weights import unchanged
+from beers_deploy.quant.onnx.image_input import fixed_tile_px
 from beers_deploy.quant.onnx_file import (
     faults_named,
-    fixed_tile_px,
     is_quantized,
     load_onnx,
     metadata,

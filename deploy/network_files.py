@@ -30,7 +30,8 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND, BLIND_PROFILE
 from beers_deploy.profiles.toml import unreadable
 from beers_deploy.quant.encodings import SENSOR_BIASES, host_model, with_damage_of
-from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata
+from beers_deploy.quant.onnx.image_input import fixed_tile_px
+from beers_deploy.quant.onnx_file import load_onnx, metadata
 from beers_deploy.quant.sensor_bank.conditioned import required_conditioned_core, with_delta
 
 logger = logging.getLogger(__name__)

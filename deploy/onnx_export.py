@@ -20,7 +20,8 @@ from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.c_code import c_program
 from beers_deploy.quant.encodings import host_model, read_core, require_undamaged, required_tile
-from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
+from beers_deploy.quant.onnx.image_input import fixed_tile_px
+from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
 from beers_deploy.quant.sensor_bank.conditioned import (
     conditioned_core,
     delta_of_file,

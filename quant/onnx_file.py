@@ -1,7 +1,7 @@
 """Read and write ONNX files without trusting them: an invalid model is reported in one sentence.
 
-This module also reads what a network's file states about itself: its metadata, and the tile that it
-is fixed to. How an image may be cut into tiles is determined in `quant.tiling`.
+This module also reads the metadata that a network's file states about itself. The image that it
+takes is read in `quant.onnx.image_input`.
 """
 
 import re
@@ -255,21 +255,6 @@ class GraphWriter:
         )
 
 
-def image_info(name: str, channels: int, tile_px: int | None) -> onnx.ValueInfoProto:
-    """Describe an input or output of a graph that is an image (N, channels, H, W) float32.
-
-    Args:
-        name: the name of the tensor.
-        channels: the number of its channels.
-        tile_px: rows and columns of the one image that the tensor is fixed to; None leaves number
-            and size of the images free.
-    """
-    shape: list[str | int | None] = (
-        [1, channels, tile_px, tile_px] if tile_px else ["N", channels, "H", "W"]
-    )
-    return onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape)
-
-
 OUTPUT = "output"
 """The metadata key of the name of the output, in a network with only one of its outputs."""
 
@@ -306,73 +291,6 @@ def with_one_output(model: onnx.ModelProto, name: str, where: str) -> onnx.Model
         parts.extend(needed)
     onnx.helper.set_model_props(copy, {**metadata(copy), OUTPUT: name})
     return _simplified(copy, where, to_run=False)
-
-
-def fixed_tile_px(model: onnx.ModelProto) -> int | None:
-    """Return the side in pixels of the square image that a model is fixed to, or None if it accepts
-    any size.
-
-    Raises:
-        ModelError: the model has not exactly one input, or it is not one image (`require_image`).
-    """
-    if len(model.graph.input) != 1:
-        raise ModelError(
-            f"The network must have one input (N, C, H, W), but it has {len(model.graph.input)}. "
-            "Export it with one image as its input."
-        )
-    image = model.graph.input[0]
-    sizes = [d.dim_value for d in image.type.tensor_type.shape.dim]
-    require_image(image.name, sizes)
-    return sizes[2] or None
-
-
-def require_image(name: str, sizes: Sequence[int], square: bool = True) -> None:
-    """Raise ModelError unless an input is one image of stated channels.
-
-    Args:
-        name: the name of the input.
-        sizes: the sizes that the file states, 0 where it states none.
-        square: True to require also that height and width are equal, or both free.
-    """
-    if len(sizes) != 4 or sizes[0] > 1:
-        rule = "be one image (N, C, H, W)"
-        remedy = "for one image, or for any number of them"
-    elif sizes[1] < 1:
-        rule = "state its number of channels, the second size"
-        remedy = "with a fixed number of channels"
-    elif square and sizes[2] != sizes[3]:
-        rule = "have a height and width that are equal or both free"
-        remedy = "with free or with equal height and width"
-    else:
-        return
-    raise ModelError(
-        f"The input {printable(repr(name))} must {rule}, but its sizes are {list(sizes)} (0 is "
-        f"free). Export the network {remedy}."
-    )
-
-
-def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Return a network that is fixed to one size of image as a network for images of any size.
-
-    Only networks whose inputs and outputs all have the axes (N, C, H, W) can be changed. Others are
-    returned unchanged.
-
-    Args:
-        model: a network; not changed.
-    """
-    if fixed_tile_px(model) is None:
-        return model
-    copy = deepcopy(model)
-    for value in (*copy.graph.input, *copy.graph.output):
-        dims = value.type.tensor_type.shape.dim
-        # A classifier's result has two sizes, and its image one size only.
-        if len(dims) != 4:
-            return model
-        for side, name in zip(dims[2:], ("H", "W"), strict=True):
-            side.dim_param = name
-    # Sizes of inner tensors that the file states are those of the fixed tile.
-    del copy.graph.value_info[:]
-    return copy
 
 
 def is_quantized(model: onnx.ModelProto) -> bool:

@@ -39,7 +39,8 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.host_part import DualRange, HostPart, Plain
 from beers_deploy.quant.input_range import to_shares
-from beers_deploy.quant.onnx_file import fixed_tile_px, metadata
+from beers_deploy.quant.onnx.image_input import fixed_tile_px
+from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.quant.passes.dual_range import (
     can_write_copies,
     with_copies,

@@ -30,7 +30,8 @@ from beers_deploy.quant.graph import (
 from beers_deploy.quant.graph.writer import graph_to_onnx
 from beers_deploy.quant.host_part import ONE_CHANNEL, HostPart
 from beers_deploy.quant.kernels import with_exact_sums, with_wide_convolutions
-from beers_deploy.quant.onnx_file import any_size, fixed_tile_px, is_quantized, load_onnx
+from beers_deploy.quant.onnx.image_input import any_size, fixed_tile_px
+from beers_deploy.quant.onnx_file import is_quantized, load_onnx
 from beers_deploy.quant.untrusted import contradictions, times
 
 

@@ -26,7 +26,7 @@ from beers_deploy.quant.graph import CORRECTION, Activation, Pointwise
 from beers_deploy.quant.graph.quantized import Scale, stated
 from beers_deploy.quant.host_part import ONE_CHANNEL, ZERO
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
-from beers_deploy.quant.onnx_file import any_size
+from beers_deploy.quant.onnx.image_input import any_size
 from beers_deploy.quant.session import (
     open_any_size,
     open_session,

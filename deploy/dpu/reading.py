@@ -23,8 +23,9 @@ from beers_deploy.quant.encodings import BORDER_PX, PLACE_PX, as_on_board
 from beers_deploy.quant.graph.pixel_shuffle import with_shuffles
 from beers_deploy.quant.graph.quantized import Integers
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.image_input import require_image
 from beers_deploy.quant.onnx.window import Pair, Window
-from beers_deploy.quant.onnx_file import faults_named, load_onnx, metadata, require_image
+from beers_deploy.quant.onnx_file import faults_named, load_onnx, metadata
 from beers_deploy.quant.untrusted import contradictions
 
 BANK_GAINS = np.arange(8 * GAINS[0], 8 * GAINS[1] + 1) / 8

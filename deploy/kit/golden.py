@@ -31,7 +31,8 @@ from beers_deploy.quant.encodings import read_core, require_undamaged
 from beers_deploy.quant.graph import PLANES
 from beers_deploy.quant.input_range import from_shares
 from beers_deploy.quant.integer.reference import run_core
-from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px
+from beers_deploy.quant.onnx.image_input import fixed_tile_px
+from beers_deploy.quant.onnx_file import faults_named
 from beers_deploy.quant.untrusted import times
 from beers_deploy.results import Input, Table
 

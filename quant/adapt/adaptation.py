@@ -28,7 +28,7 @@ from beers_deploy.quant.adapt.replacements import (
 from beers_deploy.quant.gate import GateResult, compare, figure_of
 from beers_deploy.quant.graph import read_network
 from beers_deploy.quant.onnx.graph import OnnxGraph
-from beers_deploy.quant.onnx_file import fixed_tile_px
+from beers_deploy.quant.onnx.image_input import fixed_tile_px
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_any_size
 from beers_deploy.quant.tiling.receptive_field import tiling_of

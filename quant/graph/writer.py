@@ -25,8 +25,9 @@ from beers_deploy.quant.graph.operations import (
     Resize,
     Shuffle,
 )
+from beers_deploy.quant.onnx.image_input import image_info
 from beers_deploy.quant.onnx.window import Window
-from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
+from beers_deploy.quant.onnx_file import GraphWriter, make_model
 
 
 def graph_to_onnx(graph: Graph, outputs: list[str], channels: int = 3) -> onnx.ModelProto:

@@ -17,7 +17,7 @@ from beers_deploy.quant.integer.reference import (
     merged_correction,
     run_core,
 )
-from beers_deploy.quant.onnx_file import any_size
+from beers_deploy.quant.onnx.image_input import any_size
 from beers_deploy.quant.session import (
     few_crops,
     open_any_size,

@@ -30,7 +30,7 @@ from beers_deploy.quant.input_range import (
     require_ranges,
     to_shares,
 )
-from beers_deploy.quant.onnx_file import fixed_tile_px
+from beers_deploy.quant.onnx.image_input import fixed_tile_px
 from beers_deploy.quant.samples.patches import PATCH_PX, Pair, Patches
 from beers_deploy.quant.samples.stored import (
     IN_MEMORY,

@@ -30,7 +30,8 @@ from onnx import TypeProto
 
 from beers_deploy.quant.graph.pixel_shuffle import MOVES, with_shuffles
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
-from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px
+from beers_deploy.quant.onnx.image_input import fixed_tile_px
+from beers_deploy.quant.onnx_file import faults_named
 from beers_deploy.quant.tiling.axis_maps import AXIS_MAPS, AxisMap, AxisNode, not_tileable
 from beers_deploy.quant.untrusted import contradictions
 

@@ -19,7 +19,8 @@ from beers_deploy.network import Network
 from beers_deploy.parity import require_parity, torch_network
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.quant.onnx_file import fixed_tile_px, metadata, save_onnx
+from beers_deploy.quant.onnx.image_input import fixed_tile_px
+from beers_deploy.quant.onnx_file import metadata, save_onnx
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from tests.deploy.command_line import done, refused

@@ -19,13 +19,8 @@ from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.limits import Limits, judge
-from beers_deploy.quant.onnx_file import (
-    GraphWriter,
-    image_info,
-    load_onnx,
-    make_model,
-    save_onnx,
-)
+from beers_deploy.quant.onnx.image_input import image_info
+from beers_deploy.quant.onnx_file import GraphWriter, load_onnx, make_model, save_onnx
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.structure import Relus, count_relus, rounded_tensors, saturated_shares

@@ -15,7 +15,8 @@ from onnx import helper
 import beers_deploy as bd
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.quant.input_range import from_shares, to_shares
-from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
+from beers_deploy.quant.onnx.image_input import image_info
+from beers_deploy.quant.onnx_file import GraphWriter, make_model
 from tests.quant.quick import one_guess
 
 CHANNELS = 4

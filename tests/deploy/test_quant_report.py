@@ -17,7 +17,8 @@ from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.gate import Spread
-from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, make_model, save_onnx
+from beers_deploy.quant.onnx.image_input import fixed_tile_px
+from beers_deploy.quant.onnx_file import load_onnx, make_model, save_onnx
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session
 from beers_deploy.quantization import steps_of

@@ -19,7 +19,8 @@ from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import BeersError
 from beers_deploy.quant.encodings import encoding_faults
 from beers_deploy.quant.graph import correction_graph
-from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx
+from beers_deploy.quant.onnx.image_input import fixed_tile_px
+from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_any_size, open_session, run
 from beers_deploy.quant.structure import count_relus, rounded_tensors, saturated_shares
 from beers_deploy.quant.tiling.receptive_field import tiling_of

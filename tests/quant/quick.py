@@ -25,7 +25,8 @@ from beers_deploy.quant.graph import (
     same,
 )
 from beers_deploy.quant.host_part import ONE_CHANNEL, HostPart
-from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
+from beers_deploy.quant.onnx.image_input import image_info
+from beers_deploy.quant.onnx_file import GraphWriter, make_model
 from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.samples.simulated import draw_patches

@@ -21,7 +21,8 @@ from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.graph import Activation, Add, Pointwise, Resize, read_network, read_planes
 from beers_deploy.quant.onnx.graph import OnnxGraph
-from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model, metadata
+from beers_deploy.quant.onnx.image_input import image_info
+from beers_deploy.quant.onnx_file import GraphWriter, make_model, metadata
 from beers_deploy.quant.passes.finetune import Tuning, finetune
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session, result_of

@@ -24,7 +24,8 @@ from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
 from beers_deploy.quant.integer.agreement import agreement
 from beers_deploy.quant.integer.reference import run_core
-from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
+from beers_deploy.quant.onnx.image_input import image_info
+from beers_deploy.quant.onnx_file import GraphWriter, make_model
 from beers_deploy.quant.passes.selection import Passes
 from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.session import open_session, result_of

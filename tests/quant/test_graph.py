@@ -19,7 +19,8 @@ from beers_deploy.quant.graph import (
     read_network,
 )
 from beers_deploy.quant.host_part import IMAGE_SLICES
-from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
+from beers_deploy.quant.onnx.image_input import image_info
+from beers_deploy.quant.onnx_file import GraphWriter, make_model
 from beers_deploy.quant.session import open_session, result_of
 from tests.quant.quick import behind_conv, copied
 

@@ -31,7 +31,8 @@ from beers_deploy.quant.input_range import (
 )
 from beers_deploy.quant.integer.agreement import agreement
 from beers_deploy.quant.integer.reference import run_core
-from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
+from beers_deploy.quant.onnx.image_input import image_info
+from beers_deploy.quant.onnx_file import GraphWriter, make_model
 from beers_deploy.quant.price import price_rows
 from beers_deploy.quant.samples.own import read_samples
 from beers_deploy.quant.samples.patches import Patches

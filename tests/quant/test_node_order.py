@@ -7,8 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.onnx.image_input import image_info
 from beers_deploy.quant.onnx.node_order import sort_nodes
-from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model, parse_onnx
+from beers_deploy.quant.onnx_file import GraphWriter, make_model, parse_onnx
 from beers_deploy.quant.session import open_session, result_of
 from tests.quant.quick import copied, image
 

@@ -11,7 +11,8 @@ import tifffile
 from onnx import TensorProto, helper
 
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
-from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
+from beers_deploy.quant.onnx.image_input import image_info
+from beers_deploy.quant.onnx_file import GraphWriter, make_model
 from beers_deploy.quant.samples.own import OwnSamples, read_samples, samples_of
 from beers_deploy.quant.samples.patches import Regenerated
 from beers_deploy.quant.tiling.receptive_field import tiling_of

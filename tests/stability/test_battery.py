@@ -10,7 +10,8 @@ import onnx
 import pytest
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model, save_onnx
+from beers_deploy.quant.onnx.image_input import image_info
+from beers_deploy.quant.onnx_file import GraphWriter, make_model, save_onnx
 from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.tiles.rows import restore_floats

@@ -23,7 +23,8 @@ from beers_deploy.profiles.target import TargetProfile, require_side
 from beers_deploy.quant.encodings import implicit_parts
 from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.graph import refusal
-from beers_deploy.quant.onnx_file import fixed_tile_px, is_quantized, metadata
+from beers_deploy.quant.onnx.image_input import fixed_tile_px
+from beers_deploy.quant.onnx_file import is_quantized, metadata
 from beers_deploy.results import Table
 
 SOURCE = "operator rules of the target profile"

@@ -34,7 +34,8 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.input_range import in_words
 from beers_deploy.quant.integer.reference import merged_correction, run_core
-from beers_deploy.quant.onnx_file import any_size, require_quantized
+from beers_deploy.quant.onnx.image_input import any_size
+from beers_deploy.quant.onnx_file import require_quantized
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.receptive_field import Tiling, tiling_of
 from beers_deploy.restoration.plan import make_plan

@@ -6,7 +6,8 @@ import numpy as np
 import onnx
 import pytest
 
-from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
+from beers_deploy.quant.onnx.image_input import image_info
+from beers_deploy.quant.onnx_file import GraphWriter, make_model
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.activations_first import activations_first
 

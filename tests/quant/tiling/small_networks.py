@@ -16,7 +16,8 @@ from onnx import helper, numpy_helper
 from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import Variant
-from beers_deploy.quant.onnx_file import any_size, image_info, make_model
+from beers_deploy.quant.onnx.image_input import any_size, image_info
+from beers_deploy.quant.onnx_file import make_model
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.tiling.receptive_field import tiling_of
