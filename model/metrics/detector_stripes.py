@@ -40,8 +40,6 @@ For a thin bright line it is 0.70, 0.46, 0.27 and 0.02 if the MTF at Nyquist is 
 """
 SPREAD_SIGNIFICANT = 4.0
 """Standard errors of the covariance from which the spread of all lines is significant."""
-LEVELS = 1.3
-"""The least ratio between the levels of blocks that distinguishes gains from offsets."""
 LINES = 16
 """The least number of lines from which their spread is determined."""
 WHITE = -0.35
@@ -86,8 +84,6 @@ class Stripes:
             independently.
         off: single deviating lines, the largest deviation first.
         dead: numbers of the lines that are constant while their neighbours are not.
-        grows_with_level: True if the deviations grow with the light (gains), False if not
-            (offsets); None if the image does not show it.
     """
 
     spread: float | None = None
@@ -95,7 +91,6 @@ class Stripes:
     significant: bool = False
     off: tuple[Line, ...] = ()
     dead: tuple[int, ...] = ()
-    grows_with_level: bool | None = None
 
     def renumbered(self, numbers: Sequence[int]) -> "Stripes":
         """Return the same faults with the line of index i called `numbers[i]`."""
@@ -132,7 +127,6 @@ def judge_lines(blocks: Blocks, least: float) -> Stripes:
         significant=significant and spread is not None and spread - spread_error > least,
         off=tuple(line for line in off if line.index not in set(dead.tolist())),
         dead=tuple(dead.tolist()),
-        grows_with_level=_grows(gains, errors, level),
     )
 
 
@@ -270,40 +264,3 @@ def _alone(second: np.ndarray, error: np.ndarray, margin: float) -> np.ndarray:
         largest = np.all(np.abs(second) > np.abs(beside), axis=0)
         least = np.maximum(ISOLATED + margin * isolation_error, LEAST_ISOLATED)
         return np.asarray(like & largest & (isolation > least))
-
-
-def _grows(gains: np.ndarray, errors: np.ndarray, level: np.ndarray) -> bool | None:
-    """Return True if the pattern of lines grows with the level; None if the blocks do not decide.
-
-    The pattern of the other blocks is fitted to each block. Over the level, gains fit all blocks
-    equally, and offsets fall as 1 / level: the slope of the logarithms is 0 or -1.
-    """
-    fits, fit_errors = np.array([_fit(gains, errors, number) for number in range(len(gains))]).T
-    levels = np.nanmean(level, axis=1)
-    use = (fits > 0) & np.isfinite(fit_errors)
-    if use.sum() < 3 or np.ptp(np.log(levels[use])) < np.log(LEVELS):
-        return None
-    x = np.log(levels[use])
-    y = np.log(fits[use])
-    weights = np.square(fits[use] / fit_errors[use])
-    x, y = (axis - np.average(axis, weights=weights) for axis in (x, y))
-    power = float((weights * x * x).sum())
-    slope = float((weights * x * y).sum()) / power
-    residual = float((weights * np.square(y - slope * x)).sum()) / (len(x) - 2)
-    error = float(np.sqrt(max(residual, 1) / power))
-    # The slope is 0 for gains and -1 for offsets: the middle between them decides.
-    return None if abs(slope + 1 / 2) < 3 * error else slope > -1 / 2
-
-
-def _fit(gains: np.ndarray, errors: np.ndarray, number: int) -> tuple[float, float]:
-    """Return the factor by which the pattern of the other blocks fits one block, and its standard
-    error.
-    """
-    others, _ = _combined(np.delete(gains, number, 0), np.delete(errors, number, 0))
-    pattern = np.nan_to_num(others)
-    power = float(np.square(pattern).sum())
-    if power == 0:
-        return 0.0, np.inf
-    noise = float(np.sqrt(np.square(pattern * np.nan_to_num(errors[number])).sum()))
-    factor = float((pattern * np.nan_to_num(gains[number])).sum()) / power
-    return factor, noise / power if noise else np.inf

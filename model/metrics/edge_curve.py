@@ -342,7 +342,7 @@ def _with_interval(
     looks = len(edges)
     if looks <= FEW_EDGES:
         looks = sum(
-            len(edge.weights) if edge.unevenness <= EVEN else strips_of(edge) for edge in edges
+            edge.strip.size if edge.unevenness <= EVEN else strips_of(edge) for edge in edges
         )
     # Few looks ask for Student's quantile, and a bootstrap's variance is too small by (n - 1) / n.
     wider = (

@@ -104,10 +104,6 @@ class FittedEdge:
     Attributes:
         pixels: the pixels of the edge.
         line: the line of the edge.
-        levels: (6,) the left plane, then the right one: pixel value in the middle of the edge,
-            change over half the edge's length along it, change over HALF_PX across it.
-        weights: (P,) one over the standard deviation of each pixel near the edge, including texture
-            and Huber's weight.
         step: difference of the planes at the edge.
         unevenness: root mean square of the residual texture of the planes, relative to the step.
         normal: (P + 9, 9) weighted derivatives of the P pixels by planes and line, followed by the
@@ -119,8 +115,6 @@ class FittedEdge:
 
     pixels: EdgePixels
     line: EdgeLine
-    levels: np.ndarray
-    weights: np.ndarray
     step: float
     unevenness: float
     normal: np.ndarray
@@ -189,8 +183,6 @@ def fit_edge(
         fitted = FittedEdge(
             pixels,
             line,
-            levels,
-            pixel_weights,
             abs(step),
             unevenness,
             normal,

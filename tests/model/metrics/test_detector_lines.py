@@ -96,15 +96,6 @@ def test_a_margin_and_a_constant_image_are_no_dead_columns() -> None:
     assert np.flatnonzero(constant_columns(image)).tolist() == [20, 21]
 
 
-@pytest.mark.parametrize("gains", [True, False])
-def test_gains_grow_with_the_level_and_offsets_do_not(gains: bool) -> None:
-    generator = np.random.default_rng(5)
-    level = np.repeat([200.0, 400, 800, 1600, 300, 1000, 600, 1400], 64)[:, None]
-    pattern = generator.standard_normal(200)
-    image = level * (1 + 0.02 * pattern) if gains else level + 12 * pattern
-    assert judged(noisy(image, generator)).grows_with_level is gains
-
-
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (5, 5), (3, 200), (200, 3), (64, 7)])
 @pytest.mark.parametrize("value", [0.0, 5.0, np.nan])
 def test_what_is_too_small_or_empty_says_nothing(shape: tuple[int, int], value: float) -> None:
