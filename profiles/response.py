@@ -151,18 +151,22 @@ class MtfTable:
         gamma stays constant, so the contrast continues to fall.
         """
         radius = np.hypot(fx, fy)
-        gamma_x, gamma_y = (self._gamma(radius, contrast) for contrast in (self.across, self.along))
+        gamma_x, gamma_y = self.gammas(radius)
         optics = np.exp(-np.hypot(gamma_x * fx, gamma_y * fy))
         return np.asarray(optics * np.sinc(fx) * np.sinc(fy))
 
-    def _gamma(self, radius: Frequencies, contrast: tuple[float, ...]) -> Frequencies:
+    def gammas(self, radius: Frequencies) -> list[Frequencies]:
+        """Return the gamma of each axis, across and along the track, at radii of any shape."""
         frequency = np.array(self.frequency)
-        # Rounded tables exceed the detector's own contrast by a little at low frequencies.
-        loss = np.maximum(-np.log(np.array(contrast) / np.sinc(frequency)), 0.0)
         # Gamma is constant beyond the last frequency, and towards 0, where the loss cannot be
         # divided by f.
         inside = np.clip(radius, frequency[1], frequency[-1])
-        return np.asarray(np.interp(inside, frequency, loss) / inside)
+        gammas = []
+        for contrast in (self.across, self.along):
+            # Rounded tables exceed the detector's own contrast by a little at low frequencies.
+            loss = np.maximum(-np.log(np.array(contrast) / np.sinc(frequency)), 0.0)
+            gammas.append(np.asarray(np.interp(inside, frequency, loss) / inside))
+        return gammas
 
     def __str__(self) -> str:
         return (

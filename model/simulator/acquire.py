@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from beers_deploy.model.simulator.detector import Draw, detect
+from beers_deploy.model.simulator.detector import Draw, Pixels, detect
 from beers_deploy.model.simulator.mtf import sensor_transfer
 from beers_deploy.model.simulator.plan import Plan, SceneStats, scene_stats
 from beers_deploy.model.simulator.sampling import crop_divisible, sample, scene_spectrum
@@ -49,7 +49,7 @@ class PreparedScene:
 
     @cached_property
     def spectrum(self) -> np.ndarray:
-        """Half spectrum (H, W // 2 + 1) of the scene, computed when it is first needed."""
+        """Half spectrum (..., H, W // 2 + 1) of the scene, computed when it is first needed."""
         return scene_spectrum(self.radiance)
 
 
@@ -57,7 +57,7 @@ def prepare_scene(radiance: np.ndarray, oversampling: int) -> PreparedScene:
     """Crop a scene for sensors that see `oversampling` x `oversampling` of its pixels as one.
 
     Args:
-        radiance: the radiance (H, W) of the scene in W/m2/sr/um.
+        radiance: the radiance (..., H, W) of the scene in W/m2/sr/um.
         oversampling: the number of scene pixels per pixel of a sensor, along each side. The sides
             of the scene become multiples of it.
     """
@@ -85,21 +85,12 @@ def simulate_planned(
     Returns:
         Digital numbers (H / r - 2 margin, W / r - 2 margin).
     """
-    ratio = scene.oversampling
-    height, width = scene.radiance.shape
     if "mtf" not in plan.skipped:
         instrument = without(sensor, plan.skipped)
-        return acquire(
-            scene.spectrum,
-            width,
-            instrument,
-            ratio,
-            draw,
-            role,
-            margin_px=margin_px,
-            skip=plan.skipped,
-        )
+        return acquire(scene, instrument, draw, role, margin_px=margin_px, skip=plan.skipped)
     # Without any blur a target pixel is the mean of its scene pixels, which needs no transform.
+    ratio = scene.oversampling
+    height, width = scene.radiance.shape
     pixels = scene.radiance.reshape(height // ratio, ratio, width // ratio, ratio).mean((1, 3))
     return detect(crop_margin(pixels, margin_px), sensor, draw, role, plan.skipped)
 
@@ -130,22 +121,18 @@ def simulate_pair(
     Returns:
         The pair, each (..., H / r - 2 margin, W / r - 2 margin).
     """
-    radiance = crop_divisible(radiance, oversampling)
-    spectrum = scene_spectrum(radiance)
-    pair = (
-        acquire(spectrum, radiance.shape[-1], sensor, oversampling, draw, role, margin_px=margin_px)
-        for sensor, role in ((degraded, "degraded"), (reference, "reference"))
+    scene = prepare_scene(radiance, oversampling)
+    return Pair(
+        acquire(scene, degraded, draw, margin_px=margin_px),
+        acquire(scene, reference, draw, "reference", margin_px=margin_px),
     )
-    return Pair(*pair)
 
 
 def acquire(
-    spectrum: np.ndarray,
-    width: int,
+    scene: PreparedScene,
     sensor: Instrument,
-    oversampling: int,
     draw: Draw,
-    role: str,
+    role: str = "degraded",
     offset_px: tuple[float, float] = (0.0, 0.0),
     margin_px: int = MARGIN_PX,
     skip: Collection[str] = (),
@@ -153,10 +140,8 @@ def acquire(
     """Simulate one acquisition: blur and sampling, then `detect` on the target grid.
 
     Args:
-        spectrum: the half spectrum of the scene, as `sampling.scene_spectrum` returns it.
-        width: the width W of the scene in pixels.
+        scene: the prepared scene (..., H, W).
         sensor: the instrument.
-        oversampling: the number of scene pixels per pixel of the sensor, along each side.
         draw: seed and patch number of the random effects.
         role: "degraded" or "reference"; keeps the two noises of a pair independent.
         offset_px: the shift (down, right) of the sampling grid, in scene pixels.
@@ -166,9 +151,11 @@ def acquire(
     Returns:
         Digital numbers (h, w).
     """
-    transfer = sensor_transfer(spectrum.shape[-2], width, oversampling, sensor)
+    ratio = scene.oversampling
+    height, width = scene.radiance.shape[-2:]
+    transfer = sensor_transfer(height, width, ratio, sensor)
     # The transform wraps around: without a margin the far border leaks into the near one.
-    signal = crop_margin(sample(spectrum, transfer, width, oversampling, offset_px), margin_px)
+    signal = crop_margin(sample(scene.spectrum, transfer, width, ratio, offset_px), margin_px)
     return detect(signal, sensor, draw, role, skip)
 
 
@@ -181,19 +168,11 @@ def acquire_three(
         The degraded image, the reference, and the reference without noise: digital numbers (h, w)
         each.
     """
-
-    def by(sensor: Instrument, role: str, skip: Collection[str] = ()) -> np.ndarray:
-        return acquire(
-            scene.spectrum,
-            scene.radiance.shape[-1],
-            sensor,
-            scene.oversampling,
-            draw,
-            role,
-            skip=skip,
-        )
-
-    return by(degraded, "degraded"), by(reference, "reference"), by(reference, "reference", NOISE)
+    return (
+        acquire(scene, degraded, draw),
+        acquire(scene, reference, draw, "reference"),
+        acquire(scene, reference, draw, "reference", skip=NOISE),
+    )
 
 
 def acquire_padded(
@@ -217,8 +196,8 @@ def acquire_padded(
     margin_px = MARGIN_PX * oversampling
     # The last target pixel may lack scene pixels: size % -oversampling is minus their number.
     after = [margin_px - size % -oversampling for size in radiance.shape]
-    scene = np.pad(radiance, [(margin_px, end_px) for end_px in after], mode="reflect")
-    return acquire(scene_spectrum(scene), scene.shape[1], sensor, oversampling, draw, role)
+    padded = np.pad(radiance, [(margin_px, end_px) for end_px in after], mode="reflect")
+    return acquire(prepare_scene(padded, oversampling), sensor, draw, role)
 
 
 def fitting_oversampling(
@@ -237,8 +216,8 @@ def fitting_oversampling(
     )
 
 
-def crop_margin(image: np.ndarray, margin_px: int) -> np.ndarray:
-    """Cut `margin_px` pixels from every side of images (..., H, W).
+def crop_margin(image: Pixels, margin_px: int) -> Pixels:
+    """Cut `margin_px` pixels from every side of images (..., H, W), arrays or tensors.
 
     Raises:
         ImageError: nothing would be left of the images.

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from beers_deploy.model.simulator import detector
+from beers_deploy.model.simulator.acquire import crop_margin
 from beers_deploy.model.simulator.detector import NOISE_LIMIT, Draw
 from beers_deploy.model.simulator.mtf import Blur, gamma_from_mtf, transfer_function
 from beers_deploy.model.simulator.sampling import Scene, crop_divisible
@@ -102,14 +103,8 @@ def folded_signals(scene: Visited, sensors: tuple[Instrument, ...], passage: Pas
         aliases = (ground * transfer).view(passage.oversampling, height // passage.oversampling, -1)
         rows = aliases.sum(0) * ramp
         lines = torch.fft.irfft(torch.fft.ifft(rows, dim=0), n=width)
-        signals.append(within_margin(lines[:, :: passage.oversampling], passage.margin_px))
+        signals.append(crop_margin(lines[:, :: passage.oversampling], passage.margin_px))
     return signals
-
-
-def within_margin(image: Tensor, margin_px: int) -> Tensor:
-    """Cut `margin_px` pixels from every side of (H, W)."""
-    height, width = image.shape
-    return image[margin_px : height - margin_px, margin_px : width - margin_px]
 
 
 def with_look(spectrum: Tensor, look: Look, fy: Tensor, fx: Tensor) -> Tensor:
@@ -188,8 +183,7 @@ def transfer_of(
 
 def _table_gammas(table: MtfTable, radius: Tensor) -> list[Tensor]:
     """Interpolate gamma across and along the track at each radius, as `MtfTable.at` does."""
-    frequency = np.array(table.frequency)
-    evenly = np.linspace(frequency[1], frequency[-1], GAMMAS)
+    evenly = np.linspace(table.frequency[1], table.frequency[-1], GAMMAS)
     place = (radius.clamp(evenly[0], evenly[-1]) - evenly[0]) * (
         (GAMMAS - 1) / (evenly[-1] - evenly[0])
     )
@@ -197,9 +191,7 @@ def _table_gammas(table: MtfTable, radius: Tensor) -> list[Tensor]:
     left = place.int().clamp(max=GAMMAS - 2)
     share = place - left
     gammas = []
-    for contrast in (table.across, table.along):
-        losses = np.maximum(-np.log(np.array(contrast) / np.sinc(frequency)), 0.0)
-        values = np.interp(evenly, frequency, losses) / evenly
+    for values in table.gammas(evenly):
         gamma = torch.tensor(values, dtype=torch.float32).to(radius.device)
         gammas.append(torch.lerp(gamma[left], gamma[left + 1], share))
     return gammas

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from beers_deploy.model.family import SensorFamily
-from beers_deploy.model.simulator.acquire import acquire
+from beers_deploy.model.simulator.acquire import acquire, prepare_scene
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.mtf import transfer_function
 from beers_deploy.model.simulator.procedural import load_scenes
-from beers_deploy.model.simulator.sampling import Scene, scene_spectrum
+from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.training.patches import PatchRecipe, turn
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
@@ -99,11 +99,9 @@ def _simulate(ground: Ground, sensors: Sequence[Instrument], draw: Draw) -> list
     """Simulate patches (1, 1, P, P) of the same ground by the degraded sensor and, if given, the
     reference.
     """
-    radiance = ground.radiance
-    spectrum = scene_spectrum(radiance)
-    width = radiance.shape[-1]
+    scene = prepare_scene(ground.radiance, ground.oversampling)
     images = [
-        acquire(spectrum, width, sensor, ground.oversampling, draw, role) / sensor.max_dn
+        acquire(scene, sensor, draw, role) / sensor.max_dn
         for role, sensor in zip(ROLES, sensors, strict=False)
     ]
     # No two patches share a transfer function, and each is megabytes.

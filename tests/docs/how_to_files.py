@@ -14,12 +14,11 @@ from PIL import Image
 from beers_deploy.kit.board import MEASURE
 from beers_deploy.model.convbeers import save_network
 from beers_deploy.model.shipped import SHIPPED
-from beers_deploy.model.simulator.acquire import acquire
+from beers_deploy.model.simulator.acquire import acquire, prepare_scene
 from beers_deploy.model.simulator.detector import Draw, to_uint16
-from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.shipped import HERE as PROFILES
-from tests.deploy.studies.characterize.test_characterize import RATIO, SENSOR, SIDE, landscape
+from tests.deploy.studies.characterize.test_characterize import RATIO, SENSOR, landscape
 from tests.deploy.studies.detection.folders import Object, dior
 from tests.deploy.studies.detection.networks import detector, raw
 from tests.docs.walk import ROOT, Walk
@@ -95,8 +94,8 @@ def scenes(folder: Path) -> None:
     shutil.copy(folder / "aerial" / "site0.png", folder / "scene.png")
     for number in (1, 2):
         seed = number - 1
-        spectrum = scene_spectrum(landscape(seed, board=number == 1))
-        signal = acquire(spectrum, SIDE, SENSOR, RATIO, Draw(seed), "degraded")
+        ground = prepare_scene(landscape(seed, board=number == 1), RATIO)
+        signal = acquire(ground, SENSOR, Draw(seed))
         tifffile.imwrite(folder / f"raw{number}.tif", to_uint16(signal))
 
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from beers_deploy.model.metrics.fidelity import MIN_SIDE_PX, psnr_db, ssim
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.model.simulator.acquire import acquire
+from beers_deploy.model.simulator.acquire import acquire, prepare_scene
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.mtf import mtf, sensor_transfer
 from beers_deploy.model.simulator.plan import ringing_of, scene_stats
@@ -66,9 +66,8 @@ def radiance_of(image: np.ndarray, sensor: Instrument) -> np.ndarray:
 
 
 def acquired(image: np.ndarray, sensor: Instrument) -> np.ndarray:
-    radiance = radiance_of(image, sensor)
-    spectrum = scene_spectrum(radiance)
-    return acquire(spectrum, radiance.shape[-1], sensor, RATIO, Draw(0), "degraded", margin_px=0)
+    scene = prepare_scene(radiance_of(image, sensor), RATIO)
+    return acquire(scene, sensor, Draw(0), margin_px=0)
 
 
 @named([*SOUND, BY_NAME["beyond 12 bits"]])

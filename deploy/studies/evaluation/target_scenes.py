@@ -12,9 +12,8 @@ from itertools import count, product
 import numpy as np
 
 from beers_deploy.model.metrics.slanted_edge import slanted_edge
-from beers_deploy.model.simulator.acquire import NOISE, acquire
+from beers_deploy.model.simulator.acquire import NOISE, acquire, prepare_scene
 from beers_deploy.model.simulator.detector import Draw
-from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.profiles.instrument import Instrument
 
 OVERSAMPLING = 5
@@ -146,15 +145,12 @@ def acquire_targets(sensor: Instrument, reference: Instrument, seed: int) -> Tar
 def _acquire(
     scene: np.ndarray, sensor: Instrument, draw: Draw, ratio: int = OVERSAMPLING
 ) -> np.ndarray:
-    return acquire(
-        scene_spectrum(scene), scene.shape[1], sensor, ratio, draw, "degraded", margin_px=0
-    )
+    return acquire(prepare_scene(scene, ratio), sensor, draw, margin_px=0)
 
 
 def _without_noise(scene: np.ndarray, sensor: Instrument, draw: Draw) -> np.ndarray:
-    spectrum = scene_spectrum(scene)
-    side = scene.shape[1]
-    return acquire(spectrum, side, sensor, OVERSAMPLING, draw, "reference", margin_px=0, skip=NOISE)
+    prepared = prepare_scene(scene, OVERSAMPLING)
+    return acquire(prepared, sensor, draw, "reference", margin_px=0, skip=NOISE)
 
 
 def acquire_edges(sensor: Instrument, seed: int) -> Edges:

@@ -7,10 +7,9 @@ import pytest
 from beers_deploy.model.metrics.noise_blocks import Blocks, cut_blocks, join
 from beers_deploy.model.metrics.noise_line import NoiseModel, fit_noise
 from beers_deploy.model.metrics.refusal import Refusal
-from beers_deploy.model.simulator.acquire import acquire
+from beers_deploy.model.simulator.acquire import PreparedScene, acquire, prepare_scene
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.profiles.instrument import Instrument, noise_from_snr
 
 RATIO = 4
@@ -21,27 +20,21 @@ RADIANCES = (25.0, 100.0)
 
 
 @lru_cache
-def spectra() -> list[np.ndarray]:
+def scenes() -> list[PreparedScene]:
     """Two drawn landscapes, nothing on which is flat."""
     generators = np.random.default_rng(7).spawn(2)
-    return [scene_spectrum(procedural_scene(1280, 1280, g).radiance) for g in generators]
+    return [prepare_scene(procedural_scene(1280, 1280, g).radiance, RATIO) for g in generators]
 
 
 def seen(pair: tuple[float, float], seed: int, mtf_nyquist: float = 0.07) -> Blocks:
     alpha, beta = noise_from_snr(RADIANCES[0], pair[0], RADIANCES[1], pair[1])
     sensor = Instrument(mtf_nyquist, alpha, beta, GAIN, 12)
-    images = [
-        acquire(s, 1280, sensor, RATIO, Draw(seed, k), "degraded") for k, s in enumerate(spectra())
-    ]
+    images = [acquire(scene, sensor, Draw(seed, k)) for k, scene in enumerate(scenes())]
     return join([cut_blocks(image, MAX_DN) for image in images])
 
 
-def fitted(blocks: Blocks) -> NoiseModel | Refusal:
-    return fit_noise(blocks)
-
-
-def model(blocks: Blocks) -> NoiseModel:
-    fit = fitted(blocks)
+def model(blocks: Blocks, incomplete: bool = False) -> NoiseModel:
+    fit = fit_noise(blocks, incomplete)
     assert isinstance(fit, NoiseModel), fit
     return fit
 
@@ -98,7 +91,7 @@ def test_clipped_pixels_are_left_out() -> None:
 
 
 def refused(image: np.ndarray) -> str:
-    outcome = fitted(cut_blocks(image, MAX_DN))
+    outcome = fit_noise(cut_blocks(image, MAX_DN))
     assert isinstance(outcome, Refusal), outcome
     return outcome.reason
 
@@ -126,9 +119,8 @@ def test_noise_of_one_level_is_that_of_photons_with_an_interval_that_holds_a_con
     """Sky behind stars, a flat field: how the noise grows with light is not seen."""
     generator = np.random.default_rng(5)
     flat = generator.normal(800, 20, (320, 320))
-    assert isinstance(fitted(cut_blocks(flat, MAX_DN)), Refusal)
-    line = fit_noise(cut_blocks(flat, MAX_DN), incomplete=True)
-    assert isinstance(line, NoiseModel)
+    assert isinstance(fit_noise(cut_blocks(flat, MAX_DN)), Refusal)
+    line = model(cut_blocks(flat, MAX_DN), incomplete=True)
     assert line.one_level
     assert line.at(800).value == pytest.approx(400, rel=0.05)
     bright = line.at(3200)
@@ -148,9 +140,8 @@ def test_noise_that_is_not_white_is_told_by_its_stronger_part(
     rows = np.sum([weight * white[i : i + 320] for i, weight in enumerate(kernel)], axis=0)
     coloured = np.sum([weight * rows[:, i : i + 320] for i, weight in enumerate(kernel)], axis=0)
     image = level + coloured
-    assert isinstance(fitted(cut_blocks(image, MAX_DN)), Refusal)
-    line = fit_noise(cut_blocks(image, MAX_DN), incomplete=True)
-    assert isinstance(line, NoiseModel)
+    assert isinstance(fit_noise(cut_blocks(image, MAX_DN)), Refusal)
+    line = model(cut_blocks(image, MAX_DN), incomplete=True)
     assert not line.white
     assert (line.colour > 1) == (stronger == "middle")
     assert (np.diff(line.spectrum) < 0).all() == (stronger == "middle")

@@ -1,19 +1,20 @@
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from beers_deploy.model.metrics.fidelity import psnr_db
-from beers_deploy.model.raster.images import list_images
-from beers_deploy.model.simulator.acquire import MARGIN_PX, acquire, acquire_padded, simulate_pair
+from beers_deploy.model.simulator.acquire import (
+    MARGIN_PX,
+    acquire,
+    acquire_padded,
+    prepare_scene,
+    simulate_pair,
+)
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.model.simulator.sampling import read_scene, scene_spectrum
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
-from tests.model.simulator.stages import pixel_means
 
 DEGRADED, REFERENCE = (
     Sensor.load(name).nominal() for name in ("pleiades-degraded", "pleiades-reference")
@@ -32,9 +33,7 @@ def test_a_sine_keeps_the_contrast_that_the_mtf_says(
     wave = 1000 + 500 * np.cos(2 * math.pi * cycles_per_px * x)
     radiance = np.tile(wave.astype(np.float32), (pixels * ratio, 1))
     sensor = Instrument(mtf_nyquist, 0.0, 0.0, 10.0, 16)
-    dn = acquire(
-        scene_spectrum(radiance), radiance.shape[1], sensor, ratio, Draw(0), "degraded", margin_px=0
-    )
+    dn = acquire(prepare_scene(radiance, ratio), sensor, Draw(0), margin_px=0)
     line = dn.mean(0, np.float64) / 10
     bin_ = round(cycles_per_px * pixels)
     contrast = 2 * abs(np.fft.rfft(line)[bin_]) / pixels / 500
@@ -53,7 +52,7 @@ def steepest_fall(ratio: int, mtf_nyquist: float) -> float:
     step = np.full((side, side), 50.0, np.float32)
     step[:, side // 2 :] = 200.0
     sensor = Instrument(mtf_nyquist, 0.0, 0.0, 10.0, 16)
-    line = acquire(scene_spectrum(step), side, sensor, ratio, Draw(0), "degraded", margin_px=16)[0]
+    line = acquire(prepare_scene(step, ratio), sensor, Draw(0), margin_px=16)[0]
     return float(-np.diff(line).min())
 
 
@@ -120,7 +119,7 @@ def test_padding_shifts_nothing() -> None:
     """
     radiance = procedural_scene(600, 600, np.random.default_rng(3)).radiance
     padded = acquire_padded(radiance, QUIET, 3, Draw(0), "degraded")
-    cropped = acquire(scene_spectrum(radiance), 600, QUIET, 3, Draw(0), "degraded")
+    cropped = acquire(prepare_scene(radiance, 3), QUIET, Draw(0))
     inner = padded[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
     assert np.abs(inner - cropped).mean() < 2
     shifted = padded[MARGIN_PX:-MARGIN_PX, MARGIN_PX + 1 : 1 - MARGIN_PX or None]
@@ -137,23 +136,3 @@ def test_drawn_scenes_are_physical_and_repeatable() -> None:
     assert 200 < scene.max() < 1000
     assert np.array_equal(scene, again)
     assert not np.array_equal(scene, other)
-
-
-# The tests below need real images next to the repository.
-
-
-@pytest.fixture(params=["aerial-test", "pleiades"])
-def radiance(request: pytest.FixtureRequest, shared_data: Path) -> np.ndarray:
-    """A corner of at most 700 x 610 pixels of a folder's first image."""
-    return read_scene(list_images(shared_data / request.param)[0], REFERENCE).radiance[:700, :610]
-
-
-def test_a_real_pair_is_whole_numbers_of_the_same_ground(radiance: np.ndarray) -> None:
-    pair = simulate_pair(radiance, DEGRADED, REFERENCE, 3, Draw(0), margin_px=16)
-    ground = pixel_means(radiance, 3)[16:-16, 16:-16] * 10.2375
-    for image in (pair.degraded, pair.reference):
-        assert np.array_equal(image, np.rint(image))
-        assert 0 <= float(image.min()) <= float(image.max()) <= 4095
-        assert float(image.mean()) == pytest.approx(float(ground.mean()), rel=0.02)
-    closeness = [psnr_db(image, ground, 4095) for image in (pair.degraded, pair.reference)]
-    assert closeness[0] + 3 < closeness[1]

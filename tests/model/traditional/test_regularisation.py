@@ -8,14 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
 from beers_deploy.model.metrics.slanted_edge import edge_mtf, slanted_edge
-from beers_deploy.model.simulator.acquire import acquire
+from beers_deploy.model.simulator.acquire import acquire, prepare_scene
 from beers_deploy.model.simulator.detector import Draw
-from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.model.traditional.pipeline import (
     TraditionalPipeline,
     restore_strips,
@@ -84,6 +83,7 @@ def test_the_means_are_those_of_numpy() -> None:
     assert 0 < statistics.residual < statistics.noise
 
 
+@settings(max_examples=30)
 @given(seed=SEEDS, times=st.floats(1.1, 10))
 def test_epsilon_grows_with_the_noise_and_falls_with_the_contrast(seed: int, times: float) -> None:
     dn = walk((31, 43), seed, step_dn=300.0)
@@ -110,6 +110,7 @@ def test_a_change_of_the_unit_of_radiance_leaves_epsilon(seed: int, factor: floa
     assert epsilon_of([dn], scaled) == pytest.approx(epsilon_of([dn]), rel=1e-9)
 
 
+@settings(max_examples=30)
 @given(seed=SEEDS)
 def test_missing_and_saturated_areas_do_not_count(seed: int) -> None:
     dn = walk((6 * BLOCK_PX, 31), seed)
@@ -175,9 +176,7 @@ def test_the_restored_mtf_comes_near_that_of_the_reference() -> None:
 def restored_mtf(angle_deg: float, number: int) -> float:
     """Return the MTF at Nyquist of a slanted edge that the pipeline restored."""
     scene = slanted_edge(240, 5, angle_deg)
-    edge = acquire(
-        scene_spectrum(scene), scene.shape[1], DEGRADED, 5, Draw(0, number), "degraded", margin_px=0
-    )
+    edge = acquire(prepare_scene(scene, 5), DEGRADED, Draw(0, number), margin_px=0)
     restored = restore_traditional(
         torch.from_numpy(edge), TraditionalPipeline(DEGRADED, REFERENCE)
     ).numpy()

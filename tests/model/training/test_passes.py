@@ -11,10 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beers_deploy.model.curves import draw_table
-from beers_deploy.model.simulator.acquire import acquire
+from beers_deploy.model.simulator.acquire import NOISE, acquire, prepare_scene
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.model.simulator.sampling import crop_divisible, scene_spectrum
 from beers_deploy.model.training.looks import Look, Looks
 from beers_deploy.model.training.passes import (
     Pass,
@@ -34,9 +33,7 @@ PLAIN = Look(1.0)
 
 
 def of_table(seed: int) -> Instrument:
-    table = draw_table(0.1, 0.06, np.random.default_rng(seed))
-    across, along = table.at_nyquist
-    return replace(NOMINAL, response=table, mtf_nyquist=across, mtf_nyquist_along=along)
+    return with_response(NOMINAL, draw_table(0.1, 0.06, np.random.default_rng(seed)))
 
 
 SENSORS = {
@@ -56,19 +53,8 @@ def test_a_pass_shows_what_the_simulator_shows(name: str, ratio: int) -> None:
     scene = procedural_scene(307, 331, np.random.default_rng(4))
     sensor = SENSORS[name]
     phase = (0.3, -0.8)
-    radiance = crop_divisible(scene.radiance, ratio)
-    skip = ("noise", "digitising")
-    expected = acquire(
-        scene_spectrum(radiance),
-        radiance.shape[1],
-        sensor,
-        ratio,
-        Draw(0),
-        "degraded",
-        phase,
-        8,
-        skip,
-    )
+    prepared = prepare_scene(scene.radiance, ratio)
+    expected = acquire(prepared, sensor, Draw(0), offset_px=phase, margin_px=8, skip=NOISE)
     (signal,) = folded_signals(prepare(scene, ratio), (sensor,), Pass(ratio, phase, PLAIN, 8))
     actual = noiseless(signal, sensor) * sensor.max_dn
     np.testing.assert_allclose(actual.numpy(), expected, atol=0.5)

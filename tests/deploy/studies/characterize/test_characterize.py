@@ -8,10 +8,9 @@ import pytest
 import tifffile
 
 from beers_deploy.model.metrics.slanted_edge import slanted_edge
-from beers_deploy.model.simulator.acquire import acquire
+from beers_deploy.model.simulator.acquire import acquire, prepare_scene
 from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.profiles.errors import BeersError
 from beers_deploy.profiles.instrument import Instrument, noise_from_snr
 from beers_deploy.profiles.sensor import Sensor
@@ -47,8 +46,8 @@ def raw(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("raw")
     paths = folder / "board.tif", folder / "plain.tif"
     for seed, path in enumerate(paths):
-        spectrum = scene_spectrum(landscape(seed, board=seed == 0))
-        signal = acquire(spectrum, SIDE, SENSOR, RATIO, Draw(seed), "degraded")
+        scene = prepare_scene(landscape(seed, board=seed == 0), RATIO)
+        signal = acquire(scene, SENSOR, Draw(seed))
         tifffile.imwrite(path, to_uint16(signal))
     return paths
 
