@@ -32,7 +32,7 @@ from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.plan import TOLERANCE_DN, make_plan
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene, read_scene, resample
-from beers_deploy.profiles.errors import ImageError, OptionError, reason_of
+from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.reference import require_same_units
 from beers_deploy.profiles.sensor import Sensor
@@ -274,7 +274,11 @@ def write_dataset(
     if not manifest.is_file() or manifest.read_bytes() != content.encode():
         write_text(manifest, content)
     shutil.rmtree(out / "parts", ignore_errors=True)
-    return _read_summary(manifest)
+    rejected = 0
+    for text in lines.values():
+        line = json.loads(text)
+        rejected += sum(line[role]["rejected_snr_pairs"] for role in ROLES)
+    return {"patches": len(lines), "rejected_share": rejected / (rejected + 2 * len(lines))}
 
 
 def _chunks(windows: list[Window]) -> Iterator[list[Window]]:
@@ -367,23 +371,3 @@ def _check_folder(recipe: DatasetRecipe, out: Path, resume: bool) -> None:
         )
     if present != content.encode():
         write_text(path, content)
-
-
-def _read_summary(path: Path) -> dict[str, float]:
-    """Read the number of patches and the share of redrawn SNR pairs from a manifest."""
-    try:
-        lines: list[Any] = [
-            parse_json(line) for line in path.read_text(encoding="utf-8").split("\n") if line
-        ]
-        if not lines:
-            raise ValueError("it is empty")
-        rejected = sum(
-            int(line[role]["rejected_snr_pairs"])
-            for line, role in product(lines, ("degraded", "reference"))
-        )
-        return {"patches": len(lines), "rejected_share": rejected / (rejected + 2 * len(lines))}
-    except (ArithmeticError, LookupError, OSError, TypeError, ValueError) as error:
-        reason = reason_of(error)
-        raise OptionError(
-            f"{path} is not the manifest of a dataset: {reason}. Choose another folder."
-        ) from error

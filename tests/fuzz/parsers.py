@@ -19,8 +19,8 @@ from beers_deploy.dpu.cost.work import count_work
 from beers_deploy.dpu.graph import SizedGraph
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.model.convbeers import BankedConvBEERS, load_network
-from beers_deploy.model.dataset import _read_summary
 from beers_deploy.model.io.lock import part_folder
+from beers_deploy.model.manifest import matching_lines
 from beers_deploy.model.metrics.perceptual import read_tensors
 from beers_deploy.model.pairs_recipe import read_pairs_recipe
 from beers_deploy.model.raster.images import read_pixels
@@ -197,8 +197,14 @@ def runs_seeds(folder: Path) -> list[bytes]:
 
 
 def manifest_seeds(_: Path) -> list[bytes]:
-    line = {role: {"rejected_snr_pairs": 1, "sensor": "x"} for role in ("degraded", "reference")}
-    return [b"".join(json.dumps({"name": "a", **line}).encode() + b"\n" for _ in range(2))]
+    line: dict[str, object] = {role: {"sensor": "x"} for role in ("degraded", "reference")}
+    line |= {"number": 1, "name": "a", "sha256": {"line": "0"}}
+    return [b"".join(json.dumps(line).encode() + b"\n" for _ in range(2))]
+
+
+def read_manifest(path: Path) -> None:
+    """The lines by which a dataset is continued."""
+    matching_lines(path.parent, [path])
 
 
 def board_of(path: Path) -> None:
@@ -263,7 +269,7 @@ PARSERS: tuple[Parser, ...] = (
         0.3,
     ),
     Parser("journal of a run", ".json", journal_seeds, resume, of_json, 0.5),
-    Parser("dataset manifest", ".jsonl", manifest_seeds, _read_summary, of_json),
+    Parser("dataset manifest", ".jsonl", manifest_seeds, read_manifest, of_json),
     Parser(
         "training log", ".csv", lambda _: [b"step,loss\n10,0.5\n20,0.25\n"], log_lines, share=0.5
     ),
