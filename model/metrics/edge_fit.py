@@ -15,6 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from beers_deploy.model.metrics.mtf_basis import HIGHEST_CPX, REACH_PX, SAMPLES_PER_PX
+
 HALF_PX = 8
 """Half the side of the square around a found edge, and how far from an edge pixels are fitted."""
 
@@ -23,13 +25,8 @@ GAMMAS = np.linspace(0.0, 10.0, 101)
 STEEPER = (4.0, 8.0)
 """Gaussian parts that are tried on an edge that the profile's curve does not fit."""
 
-PER_PX = 16
-REACH_PX = 24
 PERIOD_PX = 250
-HIGHEST_F = 2.5
-"""The tabulated edge repeats after PERIOD_PX pixels, with the opposite sign; waves above HIGHEST_F
-cycles per pixel are 0.
-"""
+"""The tabulated edge repeats after this number of pixels, with the opposite sign."""
 START_GAMMA = 4.0
 LEAST_GAMMA = 0.05
 LARGEST_GAMMA = 9.9
@@ -108,19 +105,19 @@ def _responses(shape: float) -> np.ndarray:
     / PERIOD_PX. As a matrix product the sum would occupy every core for far longer.
 
     Returns:
-        Responses (101, 2 * REACH_PX * PER_PX + 1).
+        Responses (101, 2 * REACH_PX * SAMPLES_PER_PX + 1).
     """
-    f = (np.arange(int(HIGHEST_F * PERIOD_PX)) + 0.5) / PERIOD_PX
+    f = (np.arange(int(HIGHEST_CPX * PERIOD_PX)) + 0.5) / PERIOD_PX
     waves = np.exp(-np.outer(GAMMAS, f) - shape * f**2) * np.sinc(f) / (math.pi * f * PERIOD_PX)
-    places = np.arange(REACH_PX * PER_PX + 1)
-    sums = np.fft.ifft(waves, PERIOD_PX * PER_PX, norm="forward")[:, places]
+    places = np.arange(REACH_PX * SAMPLES_PER_PX + 1)
+    sums = np.fft.ifft(waves, PERIOD_PX * SAMPLES_PER_PX, norm="forward")[:, places]
     # The response is odd around the edge: the left half is the right one, turned around.
-    half = (sums * np.exp(1j * math.pi * places / (PERIOD_PX * PER_PX))).imag
+    half = (sums * np.exp(1j * math.pi * places / (PERIOD_PX * SAMPLES_PER_PX))).imag
     return 0.5 + np.concatenate([-half[:, :0:-1], half], axis=1)
 
 
 def _at_gammas(gammas: np.ndarray, shape: float) -> np.ndarray:
-    """Return the tabulated edge of each gamma (N,): (N, 2 * REACH_PX * PER_PX + 1)."""
+    """Return the tabulated edge of each gamma (N,): (N, 2 * REACH_PX * SAMPLES_PER_PX + 1)."""
     table = _responses(shape)
     row = np.minimum((gammas / GAMMAS[1]).astype(int), GAMMAS.size - 2)
     part = (gammas / GAMMAS[1] - row)[:, None]
@@ -131,7 +128,7 @@ def _at_distances(lines: np.ndarray, distance: np.ndarray) -> np.ndarray:
     """Return tabulated edges (N, T) at the distances (N, P) from each."""
     count, length = lines.shape
     # The last sample has no neighbour on its right.
-    place = np.clip((distance + REACH_PX) * PER_PX, 0, length - 1.001)
+    place = np.clip((distance + REACH_PX) * SAMPLES_PER_PX, 0, length - 1.001)
     column = place.astype(int)
     share = place - column
     column += np.arange(count)[:, None] * length

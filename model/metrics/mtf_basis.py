@@ -24,6 +24,7 @@ PARTS = CORNERS.size
 SAMPLES_PER_PX = 16
 REACH_PX = 24
 HIGHEST_CPX = 2.5
+"""The sampling and the reach of tabulated edges, and the highest wave in them."""
 WAVES = 1250
 """The number of waves that form the tabulated edge; it repeats after 500 pixels."""
 

@@ -16,13 +16,16 @@ import numpy as np
 SIDE_PX = 16
 PART_BLOCKS = 4
 SLOW = 0.2
-MIDDLE = 0.5
 FINE = 0.55
-"""Limits of the frequency bands, in cycles per pixel."""
+"""The end of the waves that are structure, and the beginning of those that are noise, in cycles per
+pixel.
+"""
 SPECTRUM = (0.3, 0.4, 0.5, 0.55, 0.6, 0.65, 0.7071)
 """Ends of the bands in which noise is reported, in cycles per pixel; the last is the corner of the
 spectrum.
 """
+MIDDLE = SPECTRUM.index(0.5)
+"""The number of the band of middle frequencies, from 0.5 to 0.55."""
 ROUNDING = 1 / 12
 """Variance that rounding to whole digital numbers adds, DN^2."""
 
@@ -37,7 +40,6 @@ class Blocks(NamedTuple):
     Attributes:
         mean: (N,) the mean of each block in DN.
         structure: (N,) energy of the waves up to 0.2 cycles per pixel.
-        middle: (N,) energy of the waves from 0.5 to 0.55.
         fine: (N,) energy of the waves beyond 0.55.
         spectrum: (N, 6) energy of the waves between the frequencies of SPECTRUM.
         part: (N,) number of the part of 4 x 4 blocks that a block lies in; images have different
@@ -46,7 +48,6 @@ class Blocks(NamedTuple):
 
     mean: np.ndarray
     structure: np.ndarray
-    middle: np.ndarray
     fine: np.ndarray
     spectrum: np.ndarray
     part: np.ndarray
@@ -125,8 +126,8 @@ def _measured(mean: np.ndarray, pixels: np.ndarray, part: np.ndarray) -> Blocks:
     # Not by matrix products: the threads of BLAS wait for each other longer than these small sums
     # take.
     bands = np.einsum("nk,kb->bn", _energies(pixels).reshape(-1, SIDE_PX**2), _band_means())
-    slow, middle, fine, *spectrum = bands
-    return Blocks(mean, slow, middle, fine, np.stack(spectrum, axis=1), part)
+    slow, fine, *spectrum = bands
+    return Blocks(mean, slow, fine, np.stack(spectrum, axis=1), part)
 
 
 def _energies(pixels: np.ndarray) -> np.ndarray:
@@ -148,11 +149,11 @@ def _energies(pixels: np.ndarray) -> np.ndarray:
 
 @cache
 def _band_means() -> np.ndarray:
-    """Return the weights (S * S, 9) that average the energies of slow, middle and fine waves and of
+    """Return the weights (S * S, 8) that average the energies of slow and fine waves, and of
     SPECTRUM.
     """
     place = np.arange(SIDE_PX)
     frequency = np.hypot(place[:, None], place).ravel() / (2 * SIDE_PX)
-    bands = ((1.5 / (2 * SIDE_PX), SLOW), (MIDDLE, FINE), (FINE, 1.0), *pairwise(SPECTRUM))
+    bands = ((1.5 / (2 * SIDE_PX), SLOW), (FINE, 1.0), *pairwise(SPECTRUM))
     weights = np.stack([(frequency > low) & (frequency <= high) for low, high in bands], axis=1)
     return np.asarray(weights / weights.sum(0))

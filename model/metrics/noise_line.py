@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from beers_deploy.model.metrics.noise_blocks import ROUNDING, Blocks
+from beers_deploy.model.metrics.noise_blocks import MIDDLE, ROUNDING, Blocks
 from beers_deploy.model.metrics.refusal import Refusal
 
 STRUCTURES = (10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
@@ -271,10 +271,11 @@ def _with_colour(blocks: Blocks, model: NoiseModel) -> NoiseModel:
     place = np.array([float(np.median(blocks.mean)), 1.0])
     ones = np.ones(blocks.mean.size)
     fine = float((model.alpha, model.beta) @ place)
-    bands = np.column_stack([blocks.middle, blocks.spectrum])
-    middle, *spectrum = (
-        (_fitted(blocks, ones, band)[:2] @ place - ROUNDING) / fine for band in bands.T
-    )
+    spectrum = [
+        float((_fitted(blocks, ones, band)[:2] @ place - ROUNDING) / fine)
+        for band in blocks.spectrum.T
+    ]
+    middle = spectrum[MIDDLE]
     scatter = float((model.draws @ place).std()) / fine
     white = abs(middle - 1) <= MAX_COLOUR + COLOUR_SCATTER * scatter
     stronger = 1.0 if white else max(middle, 1.0)
@@ -283,7 +284,7 @@ def _with_colour(blocks: Blocks, model: NoiseModel) -> NoiseModel:
         alpha=model.alpha * stronger,
         beta=model.beta * stronger,
         draws=model.draws * stronger,
-        colour=float(middle),
+        colour=middle,
         white=bool(white),
-        spectrum=tuple(float(value) for value in spectrum),
+        spectrum=tuple(spectrum),
     )

@@ -83,18 +83,10 @@ def mtf(
     )
     # Beyond frequency 1 the sinc is negative: the contrast is reversed there, and its sign stays.
     response = np.asarray(optics * np.sinc(fx) * np.sinc(fy))
-    return (
-        response * gaussian_response(radius, antialias_sigma_px) if antialias_sigma_px else response
-    )
-
-
-def gaussian_response(frequency: ArrayLike, sigma_px: float) -> NDArray[np.float64]:
-    """Compute exp(-2 pi^2 sigma^2 f^2), the transform of a Gaussian filter, at frequencies of any
-    shape.
-
-    It is 1 for sigma 0.
-    """
-    return np.asarray(np.exp(-2 * (math.pi * sigma_px * np.asarray(frequency, np.float64)) ** 2))
+    if not antialias_sigma_px:
+        return response
+    # The transform of a Gaussian filter.
+    return np.asarray(response * np.exp(-2 * (math.pi * antialias_sigma_px * radius) ** 2))
 
 
 def smear_response(fy: ArrayLike, length_px: float) -> NDArray[np.float64]:
