@@ -22,9 +22,8 @@ from beers_deploy.model.bank import (
     in_places,
     network_bank,
 )
-from beers_deploy.model.family import RANGES, noise_over_full_scale, sensor_vector
+from beers_deploy.model.family import RANGES, sensor_vector
 from beers_deploy.model.simulator.mtf import sensor_mtf
-from beers_deploy.model.traditional.compensate import compensation_kernel
 from beers_deploy.profiles.effects import Smear
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import unpacked
@@ -55,18 +54,6 @@ def test_details_have_sum_0_and_noise_makes_planes_of_one_size(
     noise = bank.sigma * np.sqrt(np.square(bank.planes).sum((1, 2)))
     np.testing.assert_allclose(noise, 1 / UNIT, rtol=1e-12)
     assert bank.unit == pytest.approx(UNIT * bank.sigma * np.linalg.norm(bank.analytic))
-
-
-@settings(max_examples=20)
-@given(CONTRAST, CONTRAST, st.floats(35, 220))
-def test_a_sensor_whose_axes_change_places_has_its_kernels_transposed(
-    across: float, along: float, snr: float
-) -> None:
-    upright, turned = (
-        network_bank(sensor(*axes, snr)) for axes in ((across, along), (along, across))
-    )
-    np.testing.assert_allclose(turned.details.transpose(0, 2, 1), upright.details, atol=1e-12)
-    assert turned.unit == pytest.approx(upright.unit)
 
 
 def test_a_lopsided_point_spread_transposed_has_its_kernels_transposed() -> None:
@@ -137,21 +124,6 @@ def test_no_other_kernel_of_its_size_restores_better(
             assert error(kernel + size * change, instrument, epsilon) > least
 
 
-@pytest.mark.parametrize("contrast", [0.02, 0.07, 0.12])
-def test_the_fitted_kernel_errs_less_than_the_pipelines_filter_cut_small(contrast: float) -> None:
-    instrument = sensor(contrast, contrast)
-    epsilon = EPSILON_PER_SIGMA * noise_over_full_scale(instrument)
-    uncut = compensation_kernel(contrast, REFERENCE.blur, epsilon).numpy()
-    middle = len(uncut) // 2
-    radius = SIDE_PX // 2
-    near = uncut[middle - radius : middle + radius + 1, middle - radius : middle + radius + 1]
-    itself = np.zeros((SIDE_PX, SIDE_PX))
-    itself[radius, radius] = 1
-    assert error(itself + network_bank(instrument).analytic, instrument, epsilon) < 0.9 * error(
-        near / near.sum(), instrument, epsilon
-    )
-
-
 @pytest.mark.parametrize(("alpha", "end"), [(0.0, 0), (1.0, 1)])
 def test_noise_beyond_what_was_trained_counts_as_the_nearest_end_of_it(
     alpha: float, end: int
@@ -159,16 +131,6 @@ def test_noise_beyond_what_was_trained_counts_as_the_nearest_end_of_it(
     assert (
         network_bank(replace(NOMINAL, alpha=alpha, beta=0.0)).sigma == RANGES["sigma_bright"][end]
     )
-
-
-def test_more_noise_asks_for_less_sharpening() -> None:
-    # The row alternates at the Nyquist frequency across the track, with -1 in the middle.
-    row = np.tile([-1.0, 1.0], 4)[:SIDE_PX][None].repeat(SIDE_PX, 0)
-    gains = [
-        abs((network_bank(sensor(0.07, 0.07, snr)).analytic * row).sum()) for snr in (220, 110, 35)
-    ]
-    assert gains == sorted(gains, reverse=True)
-    assert gains[0] > 1.8 * gains[2]
 
 
 @pytest.mark.parametrize("scale", [1, 2, 3])

@@ -18,6 +18,7 @@ from beers_deploy.model.variants import Kernels
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import READING, MtfTable
 from beers_deploy.profiles.sensor import Sensor
+from tests.model.simulator.stages import with_response
 
 NOMINAL = Sensor.load("pleiades-degraded").nominal()
 CONTRAST = st.floats(0.015, 0.15)
@@ -58,9 +59,7 @@ def test_a_pupil_has_its_closed_form(obscuration: float) -> None:
 
 def of_curve(contrast: np.ndarray) -> Instrument:
     values = tuple(contrast.tolist())
-    table = MtfTable(tuple(FREQUENCIES.tolist()), values, values)
-    across, along = table.at_nyquist
-    return replace(NOMINAL, response=table, mtf_nyquist=across, mtf_nyquist_along=along)
+    return with_response(NOMINAL, MtfTable(tuple(FREQUENCIES.tolist()), values, values))
 
 
 @given(CONTRAST, st.floats(0.4, 1), st.integers(0, 2**20))
@@ -68,8 +67,7 @@ def test_no_sensor_that_is_drawn_departs_from_what_was_trained(
     contrast: float, ratio: float, seed: int
 ) -> None:
     table = draw_table(contrast, ratio * contrast, np.random.default_rng(seed))
-    across, along = table.at_nyquist
-    sensor = replace(NOMINAL, response=table, mtf_nyquist=across, mtf_nyquist_along=along)
+    sensor = with_response(NOMINAL, table)
     assert "may restore worse" not in departure(sensor, "fitted")
     formula = replace(NOMINAL, mtf_nyquist=contrast, mtf_nyquist_along=ratio * contrast)
     assert departure(formula, "fitted") == departure(formula, "cut") == ""

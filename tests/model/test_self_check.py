@@ -37,6 +37,7 @@ from tests.model.consistency.images import (
     blurred,
     noisy,
     scene,
+    seen,
     sigma_dn,
 )
 from tests.model.simulator.stages import plain_sensor
@@ -92,7 +93,7 @@ def test_the_true_scene_leaves_noise_alone(sensor: Instrument) -> None:
 def test_the_scale_of_the_pixels_changes_nothing() -> None:
     """Digital numbers and shares of full scale are judged the same, as users have either."""
     sensor = SENSORS["offset"]
-    raw = noisy(blurred(scene(), sensor), sensor)
+    raw = seen(sensor)
     own = judged(SelfCheck.of(sensor, REFERENCE), raw, scene())
     of_shares = SelfCheck.of(sensor, REFERENCE, 1.0)
     shares = judged(of_shares, raw / FULL_SCALE, scene() / FULL_SCALE)
@@ -115,7 +116,7 @@ def test_what_is_no_restoration_of_the_image_is_found(name: str) -> None:
     restored, one that is moved, and one that is too sharp.
     """
     sensor = plain_sensor()
-    raw = noisy(blurred(scene(), sensor), sensor)
+    raw = seen(sensor)
     check = SelfCheck.of(sensor, REFERENCE)
     result = judged(check, raw, WRONG[name](raw, scene()))
     textured = judged(check, raw, scene()).sharpening >= LEAST_SHARPENING
@@ -154,7 +155,7 @@ def test_an_error_counts_by_its_size() -> None:
 def test_a_broken_block_is_found_where_it_is() -> None:
     """A single wrong block is found, and blocks out of reach of its light are not blamed."""
     sensor = plain_sensor()
-    raw = noisy(blurred(scene(), sensor), sensor)
+    raw = seen(sensor)
     broken = scene().copy()
     broken[2 * BLOCK_PX : 3 * BLOCK_PX, BLOCK_PX : 2 * BLOCK_PX] *= 1.2
     result = judged(SelfCheck.of(sensor, REFERENCE), raw, broken)
@@ -184,7 +185,7 @@ def test_windows_give_the_blocks_of_the_whole_image(down: set[int], across: set[
     """
     sensor = SENSORS["two axes"]
     check = SelfCheck.of(sensor, REFERENCE)
-    raw = noisy(blurred(scene(), sensor), sensor)
+    raw = seen(sensor)
     raw[150:160, 20:30] = np.nan
     raw[40, 200] = FULL_SCALE
     whole = judged(check, raw, scene())

@@ -59,28 +59,8 @@ def test_full_resolution_is_meant_where_no_scale_is_said(tmp_path: Path) -> None
     assert load_network(path)[0].variant.scale == 1
 
 
-def test_tensors_of_any_layout_and_kind_come_back(tmp_path: Path) -> None:
-    tensors = {
-        "turned": np.arange(6.0).reshape(2, 3).T,
-        "whole": np.array([1, -2]),
-        "one": np.array(3.5),
-    }
-    write_tensors(tmp_path / "t.safetensors", tensors, {"step": 3, "name": "a b"})
-    loaded, header = read_tensors(tmp_path / "t.safetensors")
-    assert header == {"step": 3, "name": "a b"}
-    assert all(np.array_equal(loaded[name], value) for name, value in tensors.items())
-
-
-@pytest.mark.parametrize(
-    "content", [b"", b"garbage", b"\x08\x00\x00\x00\x00\x00\x00\x00{}      ", b"\xff" * 64, None]
-)
-def test_what_is_no_weights_file_or_a_truncated_one_is_refused(
-    content: bytes | None, tmp_path: Path
-) -> None:
-    path = tmp_path / "w.safetensors"
-    save_network(path, plain(Variant(1, 4)), {})
-    path.write_bytes(path.read_bytes()[:-5] if content is None else content)
-    with pytest.raises(ModelError, match=r"w\.safetensors") as caught:
+def refused(path: Path, words: str) -> None:
+    with pytest.raises(ModelError, match=words) as caught:
         load_network(path)
     assert "\n" not in str(caught.value)
 
@@ -103,9 +83,7 @@ def test_a_header_that_does_not_fit_the_tensors_is_refused(variant: object, tmp_
     write_tensors(
         tmp_path / "w.safetensors", arrays(plain(Variant(1, 4)).state_dict()), {"variant": variant}
     )
-    with pytest.raises(ModelError, match=r"weights of a ConvBEERS|number") as caught:
-        load_network(tmp_path / "w.safetensors")
-    assert "\n" not in str(caught.value)
+    refused(tmp_path / "w.safetensors", r"weights of a ConvBEERS|number")
 
 
 @pytest.mark.parametrize(
@@ -115,8 +93,7 @@ def test_another_programs_weights_are_refused(
     metadata: dict[str, str] | None, tmp_path: Path
 ) -> None:
     save_file({"weight": torch.zeros(3)}, tmp_path / "w.safetensors", metadata=metadata)
-    with pytest.raises(ModelError, match=r"w\.safetensors"):
-        load_network(tmp_path / "w.safetensors")
+    refused(tmp_path / "w.safetensors", r"w\.safetensors")
 
 
 def test_a_missing_file_and_an_unknown_variant(tmp_path: Path) -> None:
@@ -208,9 +185,7 @@ def test_conditioned_weights_need_their_header(
     save_network(path, conditioned(), {})
     tensors, header = read_tensors(path)
     write_tensors(path, tensors, header | change)
-    with pytest.raises(ModelError, match=words) as caught:
-        load_network(path)
-    assert "\n" not in str(caught.value)
+    refused(path, words)
 
 
 @pytest.mark.parametrize("tensor_name", ["tail.bias", "bias.weight"])
@@ -223,8 +198,7 @@ def test_conditioned_weights_that_lack_a_tensor_are_refused(
     write_tensors(
         path, {name: value for name, value in tensors.items() if name != tensor_name}, header
     )
-    with pytest.raises(ModelError, match=r"w\.safetensors"):
-        load_network(path)
+    refused(path, r"w\.safetensors")
 
 
 def test_the_same_weights_are_the_same_bytes(tmp_path: Path) -> None:
@@ -232,7 +206,11 @@ def test_the_same_weights_are_the_same_bytes(tmp_path: Path) -> None:
     000 times.
     """
     header = {f"key {k}": {"ä": k} for k in range(8)}
-    tensors = {"one": np.arange(3, dtype=np.float32), "two": np.ones((2, 5), np.float32)}
+    tensors = {
+        "turned": np.arange(6.0).reshape(2, 3).T,
+        "whole": np.array([1, -2]),
+        "one": np.array(3.5),
+    }
     contents = set()
     for number in range(4):
         write_tensors(tmp_path / f"{number}", tensors, header)

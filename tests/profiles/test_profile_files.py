@@ -20,12 +20,15 @@ for name, ways in TABLES.items():
     KEYS += product([name], ways[0][0])
 
 
-def refusal(path: Path) -> str:
-    """Return the message, after checking that it names the file and ends like a sentence."""
+def refusal(path: Path, *words: str) -> str:
+    """Return the message, after checking that it names the file, has these words and ends like a
+    sentence.
+    """
     with pytest.raises(ProfileError) as caught:
-        Sensor.load(str(path))
+        Sensor.load(path)
     message = str(caught.value)
-    assert "mine" in message
+    for word in ("mine", *words):
+        assert word in message
     assert message.endswith(".")
     assert message.isprintable()
     assert not message.endswith(("..", " .", ":."))
@@ -74,7 +77,7 @@ def test_text_that_is_not_unicode_is_refused(tmp_path: Path) -> None:
 def test_a_range_is_drawn_from_or_refused(old: str, new: str, tmp_path: Path) -> None:
     """Never accepted and then quietly cut to its lower end."""
     try:
-        profile = Sensor.load(str(own_sensor(tmp_path, (old, new))))
+        profile = Sensor.load(own_sensor(tmp_path, (old, new)))
     except ProfileError:
         return
     sensors = [profile.draw(np.random.default_rng(seed)) for seed in range(8)]
@@ -92,7 +95,7 @@ def test_what_loads_can_be_drawn_at_the_very_bounds(
     path = own_sensor(
         tmp_path, ("value = 50,", f"value = {snr_0},"), ("value = 110,", f"value = {snr_1},")
     )
-    sensor = Sensor.load(str(path)).draw(np.random.default_rng(0))
+    sensor = Sensor.load(path).draw(np.random.default_rng(0))
     assert sensor.alpha >= 0
     assert sensor.beta >= 0
     assert 25 / sensor.noise_sigma(25) == pytest.approx(snr_0)
@@ -167,7 +170,7 @@ def test_a_wrong_target_gets_one_sentence(
     text: str, words: tuple[str, ...], tmp_path: Path
 ) -> None:
     with pytest.raises(ProfileError) as caught:
-        TargetProfile.load(str(own_sensor(tmp_path, text=text)))
+        TargetProfile.load(own_sensor(tmp_path, text=text))
     for word in ("mine", *words):
         assert word in str(caught.value)
 

@@ -49,7 +49,7 @@ def sensor_file(folder: Path, mtf: str, noise: str | None = None) -> Path:
 
 def with_psf(folder: Path, samples: np.ndarray, mtf: str = PSF) -> Sensor:
     np.save(folder / "psf.npy", samples)
-    return Sensor.load(str(sensor_file(folder, mtf)))
+    return Sensor.load(sensor_file(folder, mtf))
 
 
 def formula(frequency: np.ndarray, contrast: float) -> np.ndarray:
@@ -57,7 +57,7 @@ def formula(frequency: np.ndarray, contrast: float) -> np.ndarray:
 
 
 def test_a_table_says_what_stands_in_it(tmp_path: Path) -> None:
-    profile = Sensor.load(str(sensor_file(tmp_path, TABLE)))
+    profile = Sensor.load(sensor_file(tmp_path, TABLE))
     sensor = profile.nominal()
     f = np.array([[0.0, 0.25, 0.5]])
     assert isinstance(sensor.response, MtfTable)
@@ -65,7 +65,7 @@ def test_a_table_says_what_stands_in_it(tmp_path: Path) -> None:
     assert sensor.response.at(np.zeros((1, 1)), f.T)[:, 0] == pytest.approx([1, 0.4, 0.05])
     assert sensor.mtf_axes == pytest.approx((0.12, 0.05))
     assert sensor == profile.draw(np.random.default_rng(3))
-    one_axis = Sensor.load(str(sensor_file(tmp_path, TABLE.rsplit("\n", 1)[0])))
+    one_axis = Sensor.load(sensor_file(tmp_path, TABLE.rsplit("\n", 1)[0]))
     assert one_axis.mtf_nyquist_along is None
     assert one_axis.nominal().mtf_axes == pytest.approx((0.12, 0.12))
 
@@ -157,9 +157,9 @@ def test_a_profile_comes_back_from_json_without_its_file(
     mtf: str, noise: str | None, tmp_path: Path
 ) -> None:
     np.save(tmp_path / "psf.npy", lopsided())
-    profile = Sensor.load(str(sensor_file(tmp_path, mtf, noise)))
+    profile = Sensor.load(sensor_file(tmp_path, mtf, noise))
     (tmp_path / "psf.npy").unlink()
-    saved = Sensor.load(str(profile.save(tmp_path / "saved.toml")))
+    saved = Sensor.load(profile.save(tmp_path / "saved.toml"))
     assert saved.nominal().mtf_axes == pytest.approx(profile.nominal().mtf_axes, rel=1e-4)
     back = validated(Sensor, json.loads(json.dumps(asdict(profile))), "a test")
     assert back == profile
@@ -170,7 +170,7 @@ def test_a_profile_comes_back_from_json_without_its_file(
 
 
 def test_another_contrast_beside_a_response_is_refused(tmp_path: Path) -> None:
-    sensor = Sensor.load(str(sensor_file(tmp_path, TABLE))).nominal()
+    sensor = Sensor.load(sensor_file(tmp_path, TABLE)).nominal()
     with pytest.raises(ValueError, match="but the response has"):
         replace(sensor, mtf_nyquist=0.2)
     assert replace(sensor, mtf_nyquist=0.2, mtf_nyquist_along=None, response=None).mtf_axes == (
@@ -213,8 +213,7 @@ def test_a_wrong_blur_gets_one_sentence(mtf: str, words: tuple[str, ...], tmp_pa
     (tmp_path / "in").mkdir()
     for folder in (tmp_path, tmp_path / "in"):
         np.save(folder / "psf.npy", lopsided())
-    message = refusal(sensor_file(tmp_path / "in", mtf))
-    assert all(word in message for word in words)
+    refusal(sensor_file(tmp_path / "in", mtf), *words)
 
 
 def spoilt(change: Callable[[np.ndarray], object]) -> np.ndarray:
@@ -242,8 +241,7 @@ def test_samples_that_are_no_point_spread_get_one_sentence(
     samples: np.ndarray, words: tuple[str, ...], tmp_path: Path
 ) -> None:
     np.save(tmp_path / "psf.npy", samples)
-    message = refusal(sensor_file(tmp_path, PSF))
-    assert all(word in message for word in words)
+    refusal(sensor_file(tmp_path, PSF), *words)
 
 
 @pytest.mark.parametrize(
@@ -259,17 +257,13 @@ def test_alpha_and_beta_are_the_noise_itself(tmp_path: Path) -> None:
     alpha = plain.nominal().alpha
     beta = plain.nominal().beta
     profile = Sensor.load(
-        str(sensor_file(tmp_path, "mtf_nyquist = 0.07", f"alpha = {alpha}\nbeta = {beta}"))
+        sensor_file(tmp_path, "mtf_nyquist = 0.07", f"alpha = {alpha}\nbeta = {beta}")
     )
     assert profile.nominal() == plain.nominal()
     # The radiances are shares of the shipped full scale, 400.
     assert (profile.radiance_0.low, profile.radiance_1.low) == (25, 100)
     ranged = Sensor.load(
-        str(
-            sensor_file(
-                tmp_path, "mtf_nyquist = 0.07", "alpha = [0.1, 0.2]\nbeta = 0\nradiance_1 = 60"
-            )
-        )
+        sensor_file(tmp_path, "mtf_nyquist = 0.07", "alpha = [0.1, 0.2]\nbeta = 0\nradiance_1 = 60")
     )
     sensors = [ranged.draw_counted(np.random.default_rng(seed)) for seed in range(20)]
     assert all(
@@ -294,8 +288,7 @@ def test_alpha_and_beta_are_the_noise_itself(tmp_path: Path) -> None:
 def test_a_wrong_noise_gets_one_sentence(
     noise: str, words: tuple[str, ...], tmp_path: Path
 ) -> None:
-    message = refusal(sensor_file(tmp_path, "mtf_nyquist = 0.07", noise))
-    assert all(word in message for word in words)
+    refusal(sensor_file(tmp_path, "mtf_nyquist = 0.07", noise), *words)
 
 
 def test_profiles_print_the_response_and_its_source(tmp_path: Path) -> None:

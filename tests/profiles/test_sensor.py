@@ -35,17 +35,14 @@ def test_the_promised_profiles_are_shipped() -> None:
 def test_every_sensor_constant_has_a_source(name: str) -> None:
     profile = Sensor.load(name)
     for key in chain.from_iterable(ways[0][0] for ways in TABLES.values()):
-        constant = getattr(profile, key)
-        assert constant.source.strip()
-        assert constant.status in ("published", "inferred", "assumed")
+        assert getattr(profile, key).status in ("published", "inferred", "assumed")
 
 
 @pytest.mark.parametrize("name", target_names())
 def test_every_target_constant_has_a_source(name: str) -> None:
     target = TargetProfile.load(name)
-    tables = [*target.tables.values(), *target.configurations.values()]
-    for table in tables:
-        assert all(constant.source.strip() for constant in table.values())
+    for table in (*target.tables.values(), *target.configurations.values()):
+        assert "stated" not in {constant.status for constant in table.values()}
 
 
 @pytest.mark.parametrize(
@@ -74,13 +71,12 @@ def test_every_target_constant_has_a_source(name: str) -> None:
 def test_a_wrong_file_gets_one_sentence(
     old: str, new: str, words: tuple[str, ...], tmp_path: Path
 ) -> None:
-    message = refusal(own_sensor(tmp_path, (old, new)))
-    assert all(word in message for word in words)
+    refusal(own_sensor(tmp_path, (old, new)), *words)
 
 
 def test_the_track_may_have_a_contrast_of_its_own(tmp_path: Path) -> None:
     both = Sensor.load(
-        str(own_sensor(tmp_path, ("[noise]", "mtf_nyquist_along = [0.03, 0.05]\n[noise]")))
+        own_sensor(tmp_path, ("[noise]", "mtf_nyquist_along = [0.03, 0.05]\n[noise]"))
     )
     one = Sensor.load("pleiades-degraded")
     assert both.nominal().mtf_axes == pytest.approx((0.07, 0.04))
@@ -107,15 +103,15 @@ def test_missing_profiles_and_files(tmp_path: Path) -> None:
     with pytest.raises(ProfileError, match="pleiades-degraded"):
         Sensor.load("hubble")
     with pytest.raises(ProfileError, match="No such file"):
-        Sensor.load(str(tmp_path / "none.toml"))
+        Sensor.load(tmp_path / "none.toml")
     (tmp_path / "empty.toml").touch()
     with pytest.raises(ProfileError, match="'description'"):
-        Sensor.load(str(tmp_path / "empty.toml"))
+        Sensor.load(tmp_path / "empty.toml")
 
 
 def test_a_bare_number_is_the_users_own_statement(tmp_path: Path) -> None:
     entry = '{ value = 0.07, status = "published", source = "paper, table 1: Sim-Degraded-Fixed" }'
-    constant = Sensor.load(str(own_sensor(tmp_path, (entry, "0.08")))).mtf_nyquist
+    constant = Sensor.load(own_sensor(tmp_path, (entry, "0.08"))).mtf_nyquist
     assert (constant.value, constant.status) == (0.08, "stated")
 
 
@@ -159,7 +155,7 @@ def with_table(folder: Path, table: str) -> Path:
 
 
 def test_a_table_calls_for_its_effect(tmp_path: Path) -> None:
-    profile = Sensor.load(str(with_table(tmp_path, "[smear]\nlength_px = [0.2, 0.4]\n")))
+    profile = Sensor.load(with_table(tmp_path, "[smear]\nlength_px = [0.2, 0.4]\n"))
     smears = [profile.draw(np.random.default_rng(s)).effects["smear"] for s in range(5)]
     lengths = {effect.length_px for effect in smears if isinstance(effect, Smear)}
     assert len(lengths) == 5
@@ -177,18 +173,13 @@ def test_a_table_calls_for_its_effect(tmp_path: Path) -> None:
 def test_a_wrong_effect_gets_one_sentence(
     table: str, words: tuple[str, ...], tmp_path: Path
 ) -> None:
-    message = refusal(with_table(tmp_path, table))
-    assert all(word in message for word in words)
+    refusal(with_table(tmp_path, table), *words)
 
 
 def test_the_units_of_another_sensor_bring_its_offset_and_no_other_effect(tmp_path: Path) -> None:
-    own = Sensor.load(str(with_table(tmp_path, "[smear]\nlength_px = 0.5\n")))
+    own = Sensor.load(with_table(tmp_path, "[smear]\nlength_px = 0.5\n"))
     other = Sensor.load(
-        str(
-            with_table(
-                tmp_path, "[smear]\nlength_px = 2\n[prnu]\nrms = 0.1\n[offset]\noffset_dn = 64"
-            )
-        )
+        with_table(tmp_path, "[smear]\nlength_px = 2\n[prnu]\nrms = 0.1\n[offset]\noffset_dn = 64")
     )
     for instrument in (
         own.in_units_of(other).nominal(),

@@ -67,7 +67,7 @@ WHOLE, *PARTS = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
 
 def test_the_example_of_the_page_is_a_profile(tmp_path: Path) -> None:
     (tmp_path / "my-sensor.toml").write_text(WHOLE, encoding="utf-8")
-    assert Sensor.load(str(tmp_path / "my-sensor.toml")).units == (10, 12, 0)
+    assert Sensor.load(tmp_path / "my-sensor.toml").units == (10, 12, 0)
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_each_other_way_of_the_page_fits_into_the_example(
     (name,) = tomllib.loads(part)
     text = re.sub(rf"\[{name}\].*?(?=\n\[)", lambda _: part, WHOLE, flags=re.DOTALL)
     (tmp_path / "my-sensor.toml").write_text(text, encoding="utf-8")
-    assert Sensor.load(str(tmp_path / "my-sensor.toml")).nominal().mtf_axes == pytest.approx(
+    assert Sensor.load(tmp_path / "my-sensor.toml").nominal().mtf_axes == pytest.approx(
         axes, abs=1e-3
     )
 
@@ -94,4 +94,4 @@ def test_profiles_print_the_file_to_start_from(tmp_path: Path) -> None:
         (tmp_path / "mine.toml").write_text(printed, encoding="utf-8")
         assert done("profiles", tmp_path / "mine.toml", "--toml") == printed
         if name in sensor_names():
-            assert same_instrument(Sensor.load(str(tmp_path / "mine.toml")), Sensor.load(name))
+            assert same_instrument(Sensor.load(tmp_path / "mine.toml"), Sensor.load(name))

@@ -101,12 +101,6 @@ def test_a_misspelt_key_or_table_is_refused_with_the_right_name(
         assert message.endswith(f". Write {table!r}.")
 
 
-@pytest.mark.parametrize("command", ["bench --target", "check --target", "profiles"])
-def test_every_command_refuses_an_unknown_table(command: str, tmp_path: Path) -> None:
-    path = board(tmp_path, "foo", "bar", "1")
-    assert "my-board.toml has the unknown key 'foo'; " in refused(*command.split(), path)
-
-
 @pytest.mark.parametrize("key", ["cores", "aie_cores", "batch_handlers", "cpb"])
 @pytest.mark.parametrize("value", ["0", "-1", "2.5"])
 def test_commands_name_file_key_and_value(key: str, value: str, tmp_path: Path) -> None:

@@ -105,10 +105,9 @@ def test_a_target_without_a_dpu_is_told_the_boards() -> None:
 
 
 @pytest.mark.parametrize("name", board_names())
-def test_check_takes_every_board_and_its_model(name: str) -> None:
-    for target in (name, f"{name}-model"):
-        output = done("check", "--tile", "64", "--target", target)
-        assert f"on {name} {load_dpu(name).name}" in " ".join(output.split())
+def test_check_takes_every_board_by_the_name_of_its_model(name: str) -> None:
+    output = done("check", "--tile", "64", "--target", f"{name}-model")
+    assert f"on {name} {load_dpu(name).name}" in " ".join(output.split())
 
 
 @pytest.mark.parametrize("command", ["check", "quantize", "gate", "stress"])

@@ -28,47 +28,31 @@ Pixels = NDArray[np.float64] | NDArray[np.float32]
 
 
 FULL_SCALE = 4095
-
-
 REFERENCE = Sensor.load("pleiades-degraded").reference.nominal()
-
-
-TWO_AXES = replace(plain_sensor(), mtf_nyquist=0.12, mtf_nyquist_along=0.04)
-
-
-POINT = lopsided_point()
 
 
 SENSORS: dict[str, Instrument] = {
     "formula": plain_sensor(),
-    "two axes": TWO_AXES,
+    "two axes": replace(plain_sensor(), mtf_nyquist=0.12, mtf_nyquist_along=0.04),
     "smear": plain_sensor(smear=Smear(1.5)),
     "antialias": plain_sensor(antialias=AntiAlias(0.4)),
     "offset": plain_sensor(offset=Offset(120.0)),
     "table": with_response(plain_sensor(), formula_table(0.1, 0.05)),
-    "lopsided point": with_response(plain_sensor(), POINT),
+    "lopsided point": with_response(plain_sensor(), lopsided_point()),
     "narrow point": with_response(plain_sensor(), gaussian_pixel(0.7, 0.5, 8, 65)),
 }
 """One sensor for each way in which a profile states its blur."""
 
 
 INSIDE = np.s_[40:-40, 40:-40]
-
-
 ROWS = 333
-
-
 COLUMNS = 301
 
 
 @cache
 def step_for(name: str) -> Consistency:
     """The step without the one for finer detail."""
-    return coarse(SENSORS[name])
-
-
-def coarse(sensor: Instrument) -> Consistency:
-    return replace(Consistency.of(sensor, REFERENCE), detail=None)
+    return replace(Consistency.of(SENSORS[name], REFERENCE), detail=None)
 
 
 @cache
@@ -112,6 +96,11 @@ def noisy(image: Pixels, sensor: Instrument, seed: int = 1) -> NDArray[np.float3
     """Add noise of the sensor at 1500 DN, which stays below full scale."""
     noise = np.random.default_rng(seed).normal(0, sigma_dn(sensor, 1500), image.shape)
     return np.clip(image + noise, 0, FULL_SCALE - 1).astype(np.float32)
+
+
+def seen(sensor: Instrument) -> NDArray[np.float32]:
+    """The scene as the sensor acquires it."""
+    return noisy(blurred(scene(), sensor), sensor)
 
 
 def corrected(step: Consistency, raw: Pixels, restored: Pixels) -> NDArray[np.float32]:

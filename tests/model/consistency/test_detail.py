@@ -20,6 +20,7 @@ from tests.model.consistency.images import (
     noisy,
     rms,
     scene,
+    seen,
     sigma_dn,
 )
 from tests.model.simulator.stages import gaussian_pixel, plain_sensor, with_response
@@ -82,7 +83,7 @@ def test_even_ground_stays_but_for_rounding(share: float) -> None:
 
 
 def test_nothing_is_added_at_the_border_nor_next_to_unknown_or_saturated_pixels() -> None:
-    raw = noisy(blurred(scene(), GAUSSIAN), GAUSSIAN)
+    raw = seen(GAUSSIAN)
     restored = scene().copy()
     restored[100:120, 130:150] = np.nan
     raw[100:120, 130:150] = 1e9

@@ -7,9 +7,9 @@ import pytest
 from beers_deploy.model.metrics.edge_blur import THOROUGH, blurs_of, combine, plain_squares
 from beers_deploy.model.metrics.edge_fit import HALF_PX, STRICT, EdgeBlur, fit_blurs
 from beers_deploy.model.metrics.slanted_edge import slanted_edge
-from beers_deploy.model.simulator.mtf import Blur, gamma_from_mtf, transfer_function
+from beers_deploy.model.simulator.mtf import Blur, gamma_from_mtf
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.model.simulator.sampling import sample, scene_spectrum
+from tests.model.simulator import stages
 
 RATIO = 4
 SIDE_PX = 120
@@ -25,9 +25,7 @@ def find_blurs(image: np.ndarray, clipped_at: float = 4095) -> list[EdgeBlur]:
 
 
 def blurred(scene: np.ndarray, mtf_nyquist: Blur, smear_px: float = 0.0) -> np.ndarray:
-    side = scene.shape[-1]
-    transfer = transfer_function(side, side, RATIO, mtf_nyquist, 0.0, smear_px)
-    return np.asarray(sample(scene_spectrum(scene), transfer, side, RATIO) * 10.0)
+    return stages.blurred(scene, RATIO, mtf_nyquist, smear_px=smear_px) * 10.0
 
 
 @lru_cache

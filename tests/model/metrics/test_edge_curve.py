@@ -89,7 +89,7 @@ def test_texture_widens_the_interval_which_holds_the_truth() -> None:
     truth = mtf_at(FREQUENCIES, weights)[SHOWN]
     widths = []
     covered = []
-    for seed in range(6):
+    for seed in range(4):
         for texture in (0.0, 0.05):
             curve = measure_curve(
                 edges_of(weights, 3, 10 + seed, texture), np.random.default_rng(0)

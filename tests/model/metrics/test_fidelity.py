@@ -5,7 +5,7 @@ import pytest
 import skimage.data
 from hypothesis import given
 from hypothesis import strategies as st
-from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from skimage.metrics import peak_signal_noise_ratio
 
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.profiles.errors import ImageError
@@ -20,17 +20,12 @@ def noisy_pair(seed: int, sigma_dn: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @given(st.integers(0, 100), st.floats(1, 300))
-def test_both_agree_with_scikit_image(seed: int, sigma_dn: float) -> None:
+def test_psnr_agrees_with_scikit_image(seed: int, sigma_dn: float) -> None:
     image, reference = noisy_pair(seed, sigma_dn)
     assert psnr_db(image, reference, 4095) == pytest.approx(
         peak_signal_noise_ratio(reference.astype(float), image.astype(float), data_range=4095),
         abs=1e-9,
     )
-    window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
-    _, full = structural_similarity(
-        reference.astype(float), image.astype(float), data_range=4095, full=True, **window
-    )
-    assert ssim(image, reference, 4095) == pytest.approx(full[5:-5, 5:-5].mean(), abs=1e-6)
 
 
 def test_identical_images_and_those_smaller_than_the_window() -> None:

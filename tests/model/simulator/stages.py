@@ -9,7 +9,7 @@ import numpy as np
 
 from beers_deploy.model.simulator.acquire import without
 from beers_deploy.model.simulator.detector import Draw, add_noise
-from beers_deploy.model.simulator.mtf import Blur, mtf, sensor_transfer
+from beers_deploy.model.simulator.mtf import Blur, mtf, sensor_transfer, transfer_function
 from beers_deploy.model.simulator.sampling import crop_divisible, sample, scene_spectrum
 from beers_deploy.profiles.effects import Effect, PixelEffect, pixel_effects, settled
 from beers_deploy.profiles.instrument import Instrument
@@ -41,6 +41,15 @@ def before_digitising(
     if "noise" not in skip:
         signal = add_noise(signal, sensor, draw.generator("noise-degraded"))
     return _apply(signal * sensor.gain_dn_per_radiance, "DN", sensor, draw, skip)
+
+
+def blurred(
+    radiance: np.ndarray, ratio: int, blur: Blur, antialias_px: float = 0.0, smear_px: float = 0.0
+) -> np.ndarray:
+    """A scene (H, W) behind a blur, at every target pixel, in W/m2/sr/um."""
+    height, width = radiance.shape
+    transfer = transfer_function(height, width, ratio, blur, antialias_px, smear_px)
+    return sample(scene_spectrum(radiance), transfer, width, ratio)
 
 
 def pixel_means(radiance: np.ndarray, ratio: int) -> np.ndarray:

@@ -10,7 +10,6 @@ import pytest
 
 from beers_deploy.model.metrics.slanted_edge import edge_mtf, slanted_edge
 from beers_deploy.model.simulator.mtf import mtf, sensor_transfer, transfer_function
-from beers_deploy.model.simulator.sampling import sample, scene_spectrum
 from beers_deploy.profiles.effects import AntiAlias, Smear
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.response import MtfTable, Response, centroid, unpacked
@@ -37,14 +36,9 @@ BLURS: dict[str, tuple[Response | tuple[float, float], tuple[float, float]]] = {
 @pytest.mark.parametrize("name", [name for name in BLURS if name != "lopsided"])
 def test_a_slanted_edge_shows_both_contrasts(name: str) -> None:
     blur, contrasts = BLURS[name]
-    side = 200
-    ratio = 4
     middle = slice(60, 140)
-    scene = slanted_edge(side, ratio, 5.0)
-    transfer = transfer_function(side * ratio, side * ratio, ratio, blur)
-    upright, lying = (
-        sample(scene_spectrum(s), transfer, side * ratio, ratio) for s in (scene, scene.T)
-    )
+    scene = slanted_edge(200, 4, 5.0)
+    upright, lying = (stages.blurred(s, 4, blur) for s in (scene, scene.T))
     assert [edge_mtf(image[middle, middle], 5.0) for image in (upright, lying.T)] == pytest.approx(
         contrasts, abs=0.005
     )
@@ -62,9 +56,7 @@ def lean(image: np.ndarray) -> float:
 def test_a_point_aslant_is_not_straightened() -> None:
     """Second moments of what is convolved add up, and a blob has none of both axes."""
     point = stages.lopsided_point()
-    image = sample(
-        scene_spectrum(stages.blob(192, 12.0)), transfer_function(192, 192, 4, point), 192, 4
-    )
+    image = stages.blurred(stages.blob(192, 12.0), 4, point)
     expected = lean(unpacked(point)) / point.samples_per_px**2
     assert abs(expected) > 0.01
     assert lean(image.astype(np.float64)) == pytest.approx(expected, rel=0.01)
@@ -73,11 +65,8 @@ def test_a_point_aslant_is_not_straightened() -> None:
 @pytest.mark.parametrize("ratio", [1, 2, 3, 5, 8])
 @pytest.mark.parametrize("name", BLURS)
 def test_no_blur_shifts_a_blob_or_changes_its_light(name: str, ratio: int) -> None:
-    side = 32 * ratio
-    blob = stages.blob(side, 2.5 * ratio)
-    image = sample(
-        scene_spectrum(blob), transfer_function(side, side, ratio, BLURS[name][0]), side, ratio
-    )
+    blob = stages.blob(32 * ratio, 2.5 * ratio)
+    image = stages.blurred(blob, ratio, BLURS[name][0])
     assert image.sum(dtype=np.float64) * ratio**2 == pytest.approx(float(blob.sum()), rel=1e-5)
     assert max(map(abs, centroid(image.astype(np.float64)))) < 0.01
 
@@ -104,15 +93,7 @@ def test_a_point_of_the_formula_gives_the_formulas_images(odd: bool, side: int) 
     point = stages.formula_point(UNEVEN, 4, 64, odd)
     radiance = 300 * np.random.default_rng(3).random((side * ratio, side * ratio), np.float32)
     radiance[: side * ratio // 2] *= 0.2
-    expected, actual = (
-        sample(
-            scene_spectrum(radiance),
-            transfer_function(*radiance.shape, ratio, blur),
-            side * ratio,
-            ratio,
-        )
-        for blur in (UNEVEN, point)
-    )
+    expected, actual = (stages.blurred(radiance, ratio, blur) for blur in (UNEVEN, point))
     limit_dn = 5.0
     if side == 64:
         limit_dn = 0.2 if odd else 3.0

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beers_deploy.model.simulator.mtf import mtf, smear_response, transfer_function
-from beers_deploy.model.simulator.sampling import crop_divisible, resample, sample, scene_spectrum
+from beers_deploy.model.simulator.sampling import resample, sample, scene_spectrum
 from beers_deploy.profiles.response import centroid
 from tests.model.simulator import stages
 
@@ -55,8 +55,7 @@ def test_fused_equals_sequential(
     ratio: int, mtf_nyquist: float, sigma: float, smear: float, rows: int, columns: int, seed: int
 ) -> None:
     radiance = 300 * np.random.default_rng(seed).random((rows * ratio, columns * ratio), np.float32)
-    transfer = transfer_function(*radiance.shape, ratio, mtf_nyquist, sigma, smear)
-    fused = sample(scene_spectrum(radiance), transfer, radiance.shape[1], ratio)
+    fused = stages.blurred(radiance, ratio, mtf_nyquist, sigma, smear)
     expected = one_after_the_other(radiance, ratio, mtf_nyquist, sigma, smear)
     assert np.abs(fused - expected).max() < 5e-4
 
@@ -64,9 +63,7 @@ def test_fused_equals_sequential(
 @pytest.mark.parametrize("smear", [0.0, 0.7, 2.0])
 @pytest.mark.parametrize("ratio", RATIOS)
 def test_nothing_is_shifted(ratio: int, smear: float) -> None:
-    side = 32 * ratio
-    transfer = transfer_function(side, side, ratio, 0.1, 0.2, smear)
-    result = sample(scene_spectrum(stages.blob(side, 3.0 * ratio)), transfer, side, ratio)
+    result = stages.blurred(stages.blob(32 * ratio, 3.0 * ratio), ratio, 0.1, 0.2, smear)
     assert max(map(abs, centroid(result.astype(np.float64)))) < 1e-3
 
 
@@ -76,16 +73,12 @@ def test_plain_slicing_would_shift_at_even_ratios(ratio: int) -> None:
     assert abs(centroid(sliced.astype(np.float64))[0]) == pytest.approx(0.5 / ratio, rel=0.05)
 
 
-def test_what_the_grid_does_not_divide_is_cropped() -> None:
-    assert crop_divisible(scene(30, 31), 4).shape == (28, 28)
-
-
 @pytest.mark.parametrize("ratio", [1, 2, 3, 5])
 def test_an_offset_moves_the_grid_over_the_scene(ratio: int) -> None:
     radiance = scene(13 * ratio, 21 * ratio)
     transfer = transfer_function(13 * ratio, 21 * ratio, ratio, 0.07)
     shifted = sample(scene_spectrum(radiance), transfer, 21 * ratio, ratio, offset_px=(2.0, -3.0))
-    rolled = sample(scene_spectrum(np.roll(radiance, (-2, 3), (0, 1))), transfer, 21 * ratio, ratio)
+    rolled = stages.blurred(np.roll(radiance, (-2, 3), (0, 1)), ratio, 0.07)
     np.testing.assert_allclose(shifted, rolled, rtol=0, atol=1e-3)
 
 
@@ -95,9 +88,7 @@ def test_a_stack_of_scenes_is_sampled_one_by_one() -> None:
     stack = sample(scene_spectrum(scenes), transfer, 63, 3)
     assert stack.shape == (3, 13, 21)
     for one, image in zip(scenes, stack, strict=True):
-        np.testing.assert_allclose(
-            sample(scene_spectrum(one), transfer, 63, 3), image, rtol=0, atol=1e-4
-        )
+        np.testing.assert_allclose(stages.blurred(one, 3, 0.07), image, rtol=0, atol=1e-4)
 
 
 def wave(height: int, width: int, cycles: tuple[int, int]) -> np.ndarray:

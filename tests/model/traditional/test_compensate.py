@@ -7,16 +7,14 @@ import pytest
 import torch
 
 from beers_deploy.model.simulator.mtf import Blur, mtf, transfer_function
-from beers_deploy.model.simulator.sampling import sample, scene_spectrum
 from beers_deploy.model.traditional import compensate as module
 from beers_deploy.model.traditional.compensate import (
     compensation_gain,
     compensation_kernel,
     filter_strips,
 )
-from beers_deploy.model.traditional.rows import fill_with_local_means, mirrored
 from beers_deploy.profiles.errors import OptionError
-from tests.model.simulator.stages import lopsided_point
+from tests.model.simulator import stages
 from tests.model.traditional.whole import compensate
 
 EPSILON = 3e-3
@@ -40,7 +38,7 @@ def test_gain_is_one_at_dc_and_finite_everywhere(
     assert (gain >= 0).all()
 
 
-@pytest.mark.parametrize("blur_from", [0.07, lopsided_point()])
+@pytest.mark.parametrize("blur_from", [0.07, stages.lopsided_point()])
 def test_without_regularisation_a_blur_is_undone_whole(blur_from: Blur) -> None:
     """What a point spread shifted and turned lies straight again: gain times blur is the target,
     phase and all.
@@ -115,24 +113,11 @@ def test_missing_pixels_reach_no_further_than_the_filter() -> None:
     assert float(nearby) < 0.7 * float((zeros - without_hole)[40:44, :30].abs().mean())
 
 
-def test_holes_are_filled_from_around() -> None:
-    image = torch.arange(63.0).expand(37, -1)
-    valid = torch.ones_like(image, dtype=torch.bool)
-    valid[5:20, 30:40] = False
-    filled = fill_with_local_means(image, valid)
-    assert torch.equal(filled[valid], image[valid])
-    torch.testing.assert_close(filled, image, rtol=0, atol=10)
-    assert torch.equal(fill_with_local_means(image, ~valid & False), torch.zeros_like(image))
-
-
 def test_it_carries_one_blur_into_the_other() -> None:
     yy, xx = np.mgrid[:261, :275]
     scene = np.asarray(2000 + 1000 * np.sin(0.9 * xx + 0.4 * yy) * np.cos(0.07 * xx), np.float32)
-    views = (
-        sample(scene_spectrum(scene), transfer_function(261, 275, 1, m), 275, 1)
-        for m in (0.07, 0.25)
-    )
-    blurred, target = map(torch.from_numpy, views)
+    before_and_after = (stages.blurred(scene, 1, m) for m in (0.07, 0.25))
+    blurred, target = map(torch.from_numpy, before_and_after)
     inside = slice(80, -80), slice(80, -80)
     before = (blurred - target)[inside].square().mean()
     after = (compensate(blurred, 0.07, 0.25, epsilon=0) - target)[inside].square().mean()
@@ -145,7 +130,3 @@ def test_it_carries_one_blur_into_the_other() -> None:
 def test_a_senseless_epsilon_is_refused(epsilon: float) -> None:
     with pytest.raises(OptionError, match="epsilon"):
         compensation_gain(8, 8, 0.07, 0.25, epsilon)
-
-
-def test_mirror_repeats_the_edge_and_may_exceed_the_image() -> None:
-    assert mirrored(-4, 8, 3).tolist() == [2, 2, 1, 0, 0, 1, 2, 2, 1, 0, 0, 1]

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from beers_deploy.model.traditional.nl_bayes import (
     nl_bayes_strips,
-    overlap_add,
     patch_matrix,
     window_distances,
     window_numbers,
@@ -65,14 +64,6 @@ def test_it_reaches_the_published_quality(camera: Tensor, sigma: float, floor_db
     assert psnr_db(nl_bayes(with_noise(clean, sigma), Noise(sigma)), clean) > floor_db
 
 
-def test_a_wrong_sigma_costs_decibels(camera: Tensor) -> None:
-    clean = camera[96:205, 160:273]
-    noisy = with_noise(clean, SIGMA)
-    right = psnr_db(nl_bayes(noisy, WHITE), clean)
-    assert psnr_db(nl_bayes(noisy, Noise(SIGMA / 2)), clean) < right - 2
-    assert psnr_db(nl_bayes(noisy, Noise(SIGMA * 2)), clean) < right - 1
-
-
 def test_denser_references_cost_time_and_gain_quality(camera: Tensor) -> None:
     clean = camera[96:205, 160:273]
     noisy = with_noise(clean, SIGMA)
@@ -113,7 +104,7 @@ def test_tiles_leave_no_trace(camera: Tensor, monkeypatch: pytest.MonkeyPatch) -
     torch.testing.assert_close(nl_bayes(noisy, WHITE), at_once, rtol=0, atol=0.05)
 
 
-@pytest.mark.parametrize("height", [1, 37, 113])
+@pytest.mark.parametrize("height", [1, 113])
 @given(cuts=st.lists(st.integers(1, 112), max_size=4))
 @settings(max_examples=4)
 def test_strips_change_no_bit(height: int, cuts: list[int], camera: Tensor) -> None:
@@ -264,11 +255,3 @@ def test_distances_are_the_sums_of_squared_differences() -> None:
     expected = (patches[first + steps] - patches[first + middle]).square().sum(2)
     expected[:, window**2 // 2] = -1
     torch.testing.assert_close(distances, expected, rtol=1e-5, atol=1e-2)
-
-
-def test_overlap_add_is_the_adjoint_of_cutting_patches() -> None:
-    one = image(13, 17).double()
-    other = torch.from_numpy(np.random.default_rng(5).standard_normal((9 * 13, 25)))
-    cut = (patch_matrix(one, 5) * other).sum()
-    pasted = (one * overlap_add(other, one.shape, 5)).sum()
-    torch.testing.assert_close(cut, pasted)

@@ -33,10 +33,6 @@ def test_noise_has_variance_one_at_every_radiance(radiance: float) -> None:
     )
 
 
-def test_without_it_the_variance_follows_the_light() -> None:
-    assert float(noisy(390, NOMINAL, 1).var() / noisy(5, NOMINAL, 1).var()) > 20
-
-
 @pytest.mark.parametrize("sensor", LIMITS)
 def test_round_trip_in_float32(sensor: Instrument) -> None:
     radiance = torch.linspace(0, 400, 4097)

@@ -22,8 +22,9 @@ from beers_deploy.model.training.source import Batch, PatchSource, cut
 from beers_deploy.model.training.stored import StoredPairs
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.instrument import Instrument
-from beers_deploy.profiles.response import MtfTable, PointSpread, packed
+from beers_deploy.profiles.response import MtfTable
 from beers_deploy.profiles.sensor import Sensor
+from tests.model.simulator.stages import point_spread, with_response
 from tests.model.training.sources import small_scene, source
 
 NOMINAL = Sensor.load("pleiades-degraded").nominal()
@@ -46,25 +47,25 @@ def equal(one: Batch, other: Batch) -> bool:
     return all(torch.equal(a, b) for a, b in zip(parts(one), parts(other), strict=True))
 
 
-PATCHES = "from tests.model.training.sources import source; made = source().batches(); next(made)"
+PATCHES = """
+import torch
+from tests.model.training.sources import source
+made = source().batches()
+next(made)
+print(torch.get_num_threads())
+"""
 
 
 @pytest.mark.slow
 def test_who_takes_the_patches_keeps_its_threads() -> None:
-    """In processes of their own: a thread decides once how many it has."""
-    thread_counts = [threads_after(work) for work in ("pass", PATCHES)]
-    assert thread_counts[0] == thread_counts[1]
-
-
-def threads_after(work: str) -> str:
-    code = f"import torch\n{work}\nprint(torch.get_num_threads())"
-    root = Path(__file__).parents[3]
-    # The suite's own processes have one thread, so a change of their number would not show there.
+    """In a process of its own: a thread decides once how many it has, and the suite's processes
+    have one.
+    """
     two = {**os.environ, "OMP_NUM_THREADS": "2"}
-    command = [sys.executable, "-c", code]
-    return subprocess.run(
-        command, cwd=root, env=two, capture_output=True, text=True, check=True
-    ).stdout
+    threads = subprocess.check_output(
+        [sys.executable, "-c", PATCHES], cwd=Path(__file__).parents[3], env=two, text=True
+    )
+    assert threads == "2\n"
 
 
 class OneSensor(SensorFamily):
@@ -93,7 +94,7 @@ def test_a_turned_patch_comes_with_the_sensor_as_it_lies() -> None:
     scene = Scene("noise", 100 + 60 * np.random.default_rng(0).random((420, 480), np.float32))
     recipe = replace(
         source().recipe,
-        family=OneSensor(Sensor.load("pleiades-degraded").nominal()),
+        family=OneSensor(NOMINAL),
         oversamplings=(2,),
     )
     ways = set()
@@ -173,21 +174,18 @@ def test_a_lopsided_blur_is_neither_mirrored_nor_turned() -> None:
         assert draw_turn(generator, True, mirrors=False) == (0, False)
         ways.append(draw_turn(generator, False))
     assert {quarter for quarter, _ in ways[2:]} == {0, 2}
-    nominal = Sensor.load("pleiades-degraded").nominal()
     samples = np.zeros((9, 9))
     samples[3:6, 4:8] = 1
     table = MtfTable((0, 0.25, 0.5), (1, 0.5, 0.1), (1, 0.5, 0.1))
-    lopsided = PointSpread(9, 9, 4, packed(samples))
-    assert nominal.symmetry == (True, True)
-    assert replace(nominal, mtf_nyquist_along=0.05).symmetry == (True, False)
+    lopsided = point_spread(samples, 4)
+    assert NOMINAL.symmetry == (True, True)
+    assert replace(NOMINAL, mtf_nyquist_along=0.05).symmetry == (True, False)
     for response, symmetry in (
         (table, (True, True)),
         (replace(table, along=(1, 0.4, 0.1)), (True, False)),
         (lopsided, (False, False)),
     ):
-        across, along = response.at_nyquist
-        sensor = replace(nominal, response=response, mtf_nyquist=across, mtf_nyquist_along=along)
-        assert sensor.symmetry == symmetry
+        assert with_response(NOMINAL, response).symmetry == symmetry
 
 
 def test_patches_lie_within_full_scale_and_a_pair_shows_the_same_ground() -> None:
