@@ -184,7 +184,11 @@ class SelfCheck:
         missing = np.isnan(raw) | np.isnan(restored)
         # Only far tails of the kernel see the filling, because pixels near it do not count.
         x = _filled(restored, missing)
-        pads = [_beyond(placed, side) for placed, side in zip((down, across), x.shape, strict=True)]
+        pads = []
+        for placed, side in zip((down, across), x.shape, strict=True):
+            # The pixels of the kernel's reach that lie beyond the image, before and after it.
+            before = REACH_PX - (placed.keep_start - placed.start)
+            pads.append((before, REACH_PX - (placed.start + side - placed.keep_stop)))
         kernel = self.rows.T @ self.columns
         wide = np.pad(x, pads, "symmetric")
         # The transform wraps around, which reaches the first 2 REACH_PX rows and columns alone.
@@ -236,17 +240,6 @@ class SelfCheck:
             places = np.arange(placed.start, placed.start + side)
             inside.append((places >= NEAR_PX) & (places < placed.size_px - NEAR_PX))
         return np.asarray(~reached & inside[0][:, None] & inside[1])
-
-
-def _beyond(placed: Placed, side: int) -> tuple[int, int]:
-    """Return the pixels of the kernel's reach that lie beyond the image, before and after it.
-
-    Args:
-        placed: where an array lies along one side of the image, and which of its pixels are kept.
-        side: the number of the array's pixels along that side.
-    """
-    before = REACH_PX - (placed.keep_start - placed.start)
-    return before, REACH_PX - (placed.start + side - placed.keep_stop)
 
 
 def noise_variances(

@@ -196,7 +196,10 @@ class Consistency:
         blurred = separable_sums(near_pixels, self.rows, self.columns, BLOCK_PX)
         blurred += self._far(finite, missing if any_missing else None, down, across)
         raw_means = block_means(raw_pixels)
-        residual = raw_means - _interpolated_excess(raw_means, self.means, self.excess) - blurred
+        excess = np.interp(raw_means, self.means, self.excess, right=0.0).astype(np.float32)
+        # A mean below the least that is possible counts as no light.
+        excess = np.minimum(excess, np.maximum(raw_means, np.float32(0)))
+        residual = raw_means - excess - blurred
         saturated = (raw >= self.full_scale).astype(np.float32)
         weights = np.float32(1) - reached_blocks(
             extend(saturated, (down, across), raw_at, NEAR_PX), NEAR_PX
@@ -307,9 +310,3 @@ def _clipped_noise(sensor: Instrument, full_scale: float) -> tuple[Image, Image]
     excess_dn = sigma_dn * density - depth * sigma_dn * ndtr(-depth)
     means = np.asarray((signal_dn + excess_dn) * unit, np.float32)
     return means, np.asarray(excess_dn * unit, np.float32)
-
-
-def _interpolated_excess(raw_means: Image, means: Image, excess: Image) -> Image:
-    """Return the excess at block means; one below the least that is possible counts as no light."""
-    values = np.interp(raw_means, means, excess, right=0.0).astype(np.float32)
-    return np.minimum(values, np.maximum(raw_means, np.float32(0)))

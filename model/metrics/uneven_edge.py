@@ -157,7 +157,9 @@ def fit_edge(
         step = levels[3] - levels[0]
         if step == 0:
             return None
-        plane = _plane(near, height)
+        ones = np.ones_like(near.along_px)
+        # The derivatives of each pixel by the three parameters of a plane.
+        plane = np.stack([ones, 2 * near.along_px / height, near.distance_px / HALF_PX], axis=1)
         share = at_distances(edge_table, near.distance_px)[:, None]
         by_levels = np.hstack([plane * (1 - share), plane * share])
         rest = near.values - by_levels @ levels
@@ -207,14 +209,6 @@ def _near(pixels: EdgePixels, line: EdgeLine) -> Side:
     distance_px = across / math.hypot(1, line.slope)
     near = np.abs(distance_px) <= HALF_PX
     return Side(distance_px[near], y[near], pixels.values[near], pixels.variance[near])
-
-
-def _plane(near: Side, height: int) -> np.ndarray:
-    """Return the derivatives (P, 3) of each pixel by the three parameters of a plane."""
-    return np.stack(
-        [np.ones_like(near.along_px), 2 * near.along_px / height, near.distance_px / HALF_PX],
-        axis=1,
-    )
 
 
 def _by_line(near: Side, line: EdgeLine, slope: np.ndarray, height: int) -> np.ndarray:

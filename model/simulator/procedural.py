@@ -194,7 +194,10 @@ def _pattern(draw: ImageDraw.ImageDraw, size: tuple[int, int]) -> None:
     lower = top + 0.9 * side
     edge = [(near, upper), (far, upper), (far + slant, lower), (near, lower)]
     draw.polygon(edge, fill=ASPHALT)
-    _star(draw, left + 1.3 * side, top + 0.5 * side, 0.42 * side)
+    star = around(left + 1.3 * side, top + 0.5 * side, 0.42 * side)
+    draw.ellipse(star, fill=WHITE)
+    for start in range(0, 360, 10):
+        draw.pieslice(star, start, start + 5, fill=ASPHALT)
     x = left + 1.85 * side
     for bar in (16.0, 12.0, 8.0, 6.0, 4.0, 3.0):
         for k in range(3):
@@ -203,13 +206,6 @@ def _pattern(draw: ImageDraw.ImageDraw, size: tuple[int, int]) -> None:
                 fill=ASPHALT,
             )
         x += 7 * bar
-
-
-def _star(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float) -> None:
-    circle = around(x, y, radius)
-    draw.ellipse(circle, fill=WHITE)
-    for start in range(0, 360, 10):
-        draw.pieslice(circle, start, start + 5, fill=ASPHALT)
 
 
 def texture(height_px: int, width_px: int, generator: np.random.Generator) -> np.ndarray:

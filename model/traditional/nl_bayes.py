@@ -285,7 +285,9 @@ def similar_groups(
         *places, guide.shape[1] - settings.side_px + 1, settings.window_px
     )
     if not bool(valid.all()):
-        _rule_out(distances, first + steps, patch_matrix(valid, settings.side_px).all(1))
+        # Neither patches with a missing pixel count, nor groups around one.
+        incomplete = ~patch_matrix(valid, settings.side_px).all(1)[first + steps]
+        distances[incomplete | incomplete[:, incomplete.shape[1] // 2, None]] = torch.inf
     usual = settings.similar
     most = min(settings.most_similar, distances.shape[1])
     candidate, nearest = nearest_first(distances, usual, most)
@@ -300,14 +302,6 @@ def similar_groups(
             counts = mask[selection, :size]
             numbers = first[selection] + steps[candidate[selection, :size]]
             yield numbers, None if bool(counts.all()) else counts.to(guide.dtype)
-
-
-def _rule_out(distances: Tensor, numbers: Tensor, complete: Tensor) -> None:
-    """Set the distance to infinity for patches (B, M) with a missing pixel, and for groups around
-    such a patch.
-    """
-    distances[~complete[numbers]] = torch.inf
-    distances[~complete[numbers[:, numbers.shape[1] // 2]]] = torch.inf
 
 
 def nearest_first(distances: Tensor, usual: int, most: int) -> tuple[Tensor, Tensor]:

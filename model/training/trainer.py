@@ -215,6 +215,8 @@ class Trainer:
         reported_at = saved_at = time.monotonic()
         waited_s = 0.0
         rows = list[list[float]]()
+        # The results of a GPU are read rarely, so that it does not wait.
+        most_unseen = UNSEEN_STEPS if self.device.type == "cuda" else 1
         with held_back() as interrupt:
             following = batches(self.step)
             while self.step < self.recipe.steps and not self.worker.any(
@@ -226,14 +228,11 @@ class Trainer:
                 self.train_step(batch)
                 now = time.monotonic()
                 save = now - saved_at > schedule.save_s
-                if (
-                    save
-                    or self._due(schedule.report_steps)
-                    or self._due(schedule.validate_steps)
-                    or self._full
-                ):
+                reports = self._due(schedule.report_steps)
+                validates = self._due(schedule.validate_steps)
+                if save or reports or validates or len(self._unseen) >= most_unseen:
                     rows += self.collected()
-                if self._due(schedule.report_steps):
+                if reports:
                     patches = len(rows) * self.recipe.batch * self.worker.count
                     elapsed_s = max(now - reported_at, 1e-9)
                     speed = Speed(patches / elapsed_s, waited_s / elapsed_s)
@@ -241,7 +240,7 @@ class Trainer:
                     rows = []
                     reported_at = now
                     waited_s = 0.0
-                if self._due(schedule.validate_steps):
+                if validates:
                     schedule.validate(self.step, self.averaged())
                 if save:
                     self.save(checkpoint)
@@ -254,13 +253,6 @@ class Trainer:
     def _due(self, every: int) -> bool:
         """Return True if `every` steps have passed again, or at the last step; never if it is 0."""
         return every > 0 and (self.step % every == 0 or self.step == self.recipe.steps)
-
-    @property
-    def _full(self) -> bool:
-        """True if the results of the last steps should be read. On a GPU they are read rarely, so
-        that it does not wait.
-        """
-        return len(self._unseen) >= (UNSEEN_STEPS if self.device.type == "cuda" else 1)
 
     def _means(self, rows: Sequence[Sequence[float]]) -> dict[str, float]:
         """Return the means of the terms of the steps since the last report, without
