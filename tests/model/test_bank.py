@@ -27,11 +27,14 @@ from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.profiles.effects import Smear
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import unpacked
-from beers_deploy.profiles.sensor import Sensor
-from tests.model.simulator.stages import lopsided_point, point_spread, with_response
+from tests.model.simulator.stages import (
+    NOMINAL,
+    REFERENCE,
+    lopsided_point,
+    point_spread,
+    with_response,
+)
 
-REFERENCE = Sensor.load("pleiades-reference").nominal()
-NOMINAL = Sensor.load("pleiades-degraded").nominal()
 CONTRAST = st.floats(0.015, 0.15)
 
 

@@ -24,20 +24,6 @@ def test_a_new_network_is_nearly_the_identity(name: str) -> None:
     assert float(difference.std()) < 0.1
 
 
-def test_the_same_seed_gives_the_same_network() -> None:
-    first, repeated, other = (list(plain(Variant(2, 4), seed).parameters()) for seed in (0, 0, 1))
-    assert all(map(torch.equal, first, repeated))
-    assert not all(map(torch.equal, first, other))
-
-
-@pytest.mark.parametrize("scale", [1, 2])
-def test_any_size_keeps_its_shape(scale: int) -> None:
-    network = plain(Variant(1, 4, scale))
-    for number, rows, columns in ((1, 1, 1), (2, 13, 21), (1, 1, 40)):
-        shape = (number, 1, rows * scale, columns * scale)
-        assert network(torch.zeros(shape)).shape == shape
-
-
 def test_at_half_resolution_a_shift_by_a_place_shifts_the_result_and_a_pixel_does_not() -> None:
     """The four pixels of a place are channels of their own: the lattice, by which tiles are cut, is
     2.

@@ -17,10 +17,8 @@ from beers_deploy.model.shipped import shipped_weights
 from beers_deploy.model.variants import Kernels
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import READING, MtfTable
-from beers_deploy.profiles.sensor import Sensor
-from tests.model.simulator.stages import with_response
+from tests.model.simulator.stages import NOMINAL, with_response
 
-NOMINAL = Sensor.load("pleiades-degraded").nominal()
 CONTRAST = st.floats(0.015, 0.15)
 
 
@@ -103,7 +101,7 @@ def test_the_recommended_network_is_shipped_and_was_trained_on_such_curves() -> 
 
 
 def test_a_family_draws_other_curves_in_their_share_and_none_is_outside_the_ranges() -> None:
-    family = SensorFamily(Sensor.load("pleiades-degraded").nominal(), other_curves=0.5)
+    family = SensorFamily(NOMINAL, other_curves=0.5)
     generator = np.random.default_rng(0)
     curves = [family.draw(generator) for _ in range(400)]
     assert np.mean([sensor.response is not None for sensor in curves]) == pytest.approx(

@@ -31,9 +31,9 @@ from beers_deploy.model.exposure import (
 )
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
+from tests.model.simulator.stages import NOMINAL
 
 FULL_SCALE = 4095.0
-NOMINAL = Sensor.load("pleiades-degraded").nominal()
 
 
 def noisier(times: float) -> Instrument:

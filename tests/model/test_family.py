@@ -12,9 +12,8 @@ from beers_deploy.model.convbeers import vector_tensor
 from beers_deploy.model.family import RANGES, SensorFamily, sensor_values, sensor_vector
 from beers_deploy.profiles.effects import Smear
 from beers_deploy.profiles.instrument import Instrument
-from beers_deploy.profiles.sensor import Sensor
+from tests.model.simulator.stages import NOMINAL
 
-NOMINAL = Sensor.load("pleiades-degraded").nominal()
 FAMILY = SensorFamily(NOMINAL)
 
 

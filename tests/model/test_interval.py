@@ -11,12 +11,11 @@ from beers_deploy.model.family import noise_over_full_scale
 from beers_deploy.model.interval import LEAST_DETAIL, MIDDLE_NOISE, PixelInterval
 from beers_deploy.model.self_check import noise_variances
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.profiles.sensor import Sensor
 from tests.model.exponents import EXPONENTS
+from tests.model.simulator.stages import NOMINAL
 
-SENSOR = Sensor.load("pleiades-degraded").nominal()
 INTERVAL = PixelInterval(EXPONENTS, {50: 0.7, 90: 1.8}, 40)
-MAX_DN = float(SENSOR.max_dn)
+MAX_DN = float(NOMINAL.max_dn)
 
 
 def test_half_widths_follow_the_formula_and_the_units() -> None:
@@ -24,12 +23,12 @@ def test_half_widths_follow_the_formula_and_the_units() -> None:
     generator = np.random.default_rng(3)
     pixels = generator.integers(0, 4096, (9, 11)).astype(np.uint16)
     known = np.ones(pixels.shape, bool)
-    half = INTERVAL.for_sensor(SENSOR, MAX_DN, 90).of(pixels, known)
+    half = INTERVAL.for_sensor(NOMINAL, MAX_DN, 90).of(pixels, known)
     window = pixels[3:6, 4:7].astype(np.float64)
-    dark, growth, square = noise_variances(SENSOR, MAX_DN)
+    dark, growth, square = noise_variances(NOMINAL, MAX_DN)
     light = window.mean()
     sigma = math.sqrt(dark + growth * light + square * light**2)
-    middle = noise_over_full_scale(SENSOR) * MAX_DN
+    middle = noise_over_full_scale(NOMINAL) * MAX_DN
     n = math.log(middle / MAX_DN / MIDDLE_NOISE)
     t = math.log(sigma / middle)
     # The MTF of this sensor is that of the middle, so that m is 0.
@@ -38,7 +37,7 @@ def test_half_widths_follow_the_formula_and_the_units() -> None:
     assert half[4, 5] == pytest.approx(wanted, rel=1e-6)
     assert half.dtype == np.float32
     # The same image in other units, such as shares of full scale.
-    scaled = INTERVAL.for_sensor(SENSOR, 1.0, 90).of(pixels / MAX_DN, known)
+    scaled = INTERVAL.for_sensor(NOMINAL, 1.0, 90).of(pixels / MAX_DN, known)
     np.testing.assert_allclose(scaled * MAX_DN, half, rtol=1e-5)
 
 
@@ -46,7 +45,7 @@ def test_windows_need_one_pixel_of_context_and_leave_missing_pixels_out() -> Non
     generator = np.random.default_rng(4)
     pixels = generator.integers(0, 4096, (20, 20)).astype(np.float32)
     known = np.ones(pixels.shape, bool)
-    width = INTERVAL.for_sensor(SENSOR, MAX_DN, 90)
+    width = INTERVAL.for_sensor(NOMINAL, MAX_DN, 90)
     whole = width.of(pixels, known)
     np.testing.assert_array_equal(width.of(pixels[6:15], known[6:15])[1:-1], whole[7:14])
     # Negative control: without context the outer rows differ.
@@ -67,9 +66,9 @@ def test_windows_need_one_pixel_of_context_and_leave_missing_pixels_out() -> Non
 
 def test_flat_ground_has_a_width_and_none_exceeds_full_scale() -> None:
     flat = np.full((5, 5), 1000, np.uint16)
-    width = INTERVAL.for_sensor(SENSOR, MAX_DN, 90)
+    width = INTERVAL.for_sensor(NOMINAL, MAX_DN, 90)
     half = width.of(flat, np.ones(flat.shape, bool))
-    dark, growth, _ = noise_variances(SENSOR, MAX_DN)
+    dark, growth, _ = noise_variances(NOMINAL, MAX_DN)
     sigma = math.sqrt(dark + growth * 1000)
     least = EXPONENTS.half_widths(width.conditions, np.array(sigma), np.array(LEAST_DETAIL))
     assert half[2, 2] == pytest.approx(1.8 * least)

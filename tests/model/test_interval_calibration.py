@@ -17,11 +17,10 @@ from beers_deploy.model.interval_calibration import (
 )
 from beers_deploy.model.levels import LEVELS
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.sensor import Sensor
 from tests.model.exponents import EXPONENTS
+from tests.model.simulator.stages import NOMINAL
 
-SENSOR = Sensor.load("pleiades-degraded").nominal()
-MAX_DN = float(SENSOR.max_dn)
+MAX_DN = float(NOMINAL.max_dn)
 
 
 def random_scores(count: int, size: int = 1, seed: int = 0) -> list[np.ndarray]:
@@ -95,7 +94,7 @@ def test_each_sensor_is_covered_whatever_the_tails_of_its_errors() -> None:
 
 def test_images_that_are_saturated_all_over_calibrate_nothing() -> None:
     white = np.full((50, 50), MAX_DN, np.float32)
-    sample = Sample.of(white, white, white, SENSOR)
+    sample = Sample.of(white, white, white, NOMINAL)
     known = sample_of(EXPONENTS, 0)
     for fitted, held_out in (([sample], [known]), ([known], [sample])):
         with pytest.raises(OptionError, match="needs pairs with pixels that are not saturated"):
@@ -113,13 +112,13 @@ def test_a_calibrated_interval_covers_what_was_held_out_and_more_by_level() -> N
     for level, quantile in interval.quantiles.items():
         assert (new <= quantile).mean() == pytest.approx(level / 100, abs=0.03)
     with pytest.raises(OptionError, match=r"one of 50, 68, 80, 90, 95 .* got 99: .* 60 images"):
-        interval.for_sensor(SENSOR, MAX_DN, 99)
+        interval.for_sensor(NOMINAL, MAX_DN, 99)
 
 
 def test_a_sample_leaves_out_the_border_and_saturated_pixels() -> None:
     raw = np.full((60, 70), 500, np.float32)
     raw[30, 30:35] = MAX_DN
     restored = raw + 1
-    sample = Sample.of(raw, restored, raw, SENSOR)
+    sample = Sample.of(raw, restored, raw, NOMINAL)
     assert sample.error.size == (60 - 2 * BORDER_PX) * (70 - 2 * BORDER_PX) - 5
     np.testing.assert_allclose(sample.error, 1)

@@ -31,7 +31,6 @@ from beers_deploy.profiles.instrument import Instrument
 from tests.model.consistency.images import (
     COLUMNS,
     FULL_SCALE,
-    REFERENCE,
     ROWS,
     SENSORS,
     blurred,
@@ -40,7 +39,7 @@ from tests.model.consistency.images import (
     seen,
     sigma_dn,
 )
-from tests.model.simulator.stages import plain_sensor
+from tests.model.simulator.stages import REFERENCE, plain_sensor
 
 
 def judged(check: SelfCheck, raw: np.ndarray, restored: np.ndarray) -> Judged:

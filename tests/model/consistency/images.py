@@ -15,8 +15,8 @@ from beers_deploy.model.consistency.step import Consistency
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.profiles.effects import AntiAlias, Offset, Smear
 from beers_deploy.profiles.instrument import Instrument
-from beers_deploy.profiles.sensor import Sensor
 from tests.model.simulator.stages import (
+    REFERENCE,
     formula_table,
     gaussian_pixel,
     lopsided_point,
@@ -28,7 +28,6 @@ Pixels = NDArray[np.float64] | NDArray[np.float32]
 
 
 FULL_SCALE = 4095
-REFERENCE = Sensor.load("pleiades-degraded").reference.nominal()
 
 
 SENSORS: dict[str, Instrument] = {

@@ -12,7 +12,6 @@ from beers_deploy.profiles.instrument import Instrument
 from tests.model.consistency.images import (
     FULL_SCALE,
     INSIDE,
-    REFERENCE,
     SENSORS,
     Pixels,
     blurred,
@@ -23,7 +22,12 @@ from tests.model.consistency.images import (
     seen,
     sigma_dn,
 )
-from tests.model.simulator.stages import gaussian_pixel, plain_sensor, with_response
+from tests.model.simulator.stages import (
+    REFERENCE,
+    gaussian_pixel,
+    plain_sensor,
+    with_response,
+)
 
 GAUSSIAN = with_response(plain_sensor(), gaussian_pixel(1.1, 1.1, 8, 129))
 """A sensor whose blur is a Gaussian of 1.1 pixels."""

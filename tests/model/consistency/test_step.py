@@ -18,7 +18,6 @@ from tests.model.consistency.images import (
     COLUMNS,
     FULL_SCALE,
     INSIDE,
-    REFERENCE,
     ROWS,
     SENSORS,
     Pixels,
@@ -31,9 +30,7 @@ from tests.model.consistency.images import (
     sigma_dn,
     step_for,
 )
-from tests.model.simulator.stages import (
-    plain_sensor,
-)
+from tests.model.simulator.stages import REFERENCE, plain_sensor
 
 Cut = tuple[int, int, int, int]
 

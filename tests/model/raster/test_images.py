@@ -11,9 +11,8 @@ from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.raster.images import image_size_px, list_images, read_pixels, site_of
 from beers_deploy.model.simulator.sampling import read_scene
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor import Sensor
+from tests.model.simulator.stages import REFERENCE
 
-SENSOR = Sensor.load("pleiades-reference").nominal()
 CAMERAS = {"dji", "img", "image", "dsc", "dscn", "dscf", "fhd", "mos", "gopr", "frame"}
 
 
@@ -38,7 +37,7 @@ def radiance_of(path: Path, pixels: np.ndarray) -> np.ndarray:
         tifffile.imwrite(path, pixels)
     else:
         Image.fromarray(pixels).save(path)
-    return read_scene(path, SENSOR).radiance
+    return read_scene(path, REFERENCE).radiance
 
 
 def test_scenes_become_radiance(tmp_path: Path) -> None:
@@ -63,7 +62,7 @@ def test_pixels_of_an_unclear_meaning_are_refused(pixels: np.ndarray, tmp_path: 
         tmp_path / "odd.tif", pixels, photometric="rgb" if pixels.ndim == 3 else "minisblack"
     )
     with pytest.raises(ImageError, match=rf"odd\.tif.*{pixels.dtype}"):
-        read_scene(tmp_path / "odd.tif", SENSOR)
+        read_scene(tmp_path / "odd.tif", REFERENCE)
 
 
 @pytest.mark.parametrize("name", ["cut.tif", "cut.png", "cut.jpg"])

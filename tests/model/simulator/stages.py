@@ -17,12 +17,14 @@ from beers_deploy.profiles.response import MtfTable, PointSpread, Response, pack
 from beers_deploy.profiles.scene_call import typical_effects
 from beers_deploy.profiles.sensor import Sensor
 
+NOMINAL = Sensor.load("pleiades-degraded").nominal()
+REFERENCE = Sensor.load("pleiades-reference").nominal()
 TYPICAL = settled(typical_effects(), lambda constant: constant.middle)
 
 
 def plain_sensor(**effects: Effect) -> Instrument:
     """The nominal degraded sensor with these effects."""
-    return replace(Sensor.load("pleiades-degraded").nominal(), effects=effects)
+    return replace(NOMINAL, effects=effects)
 
 
 def before_digitising(

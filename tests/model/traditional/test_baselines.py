@@ -6,17 +6,15 @@ from torch import Tensor
 
 from beers_deploy.model.traditional.baselines import BASELINES
 from beers_deploy.model.traditional.pipeline import TraditionalPipeline
-from beers_deploy.profiles.sensor import Sensor
+from tests.model.simulator.stages import NOMINAL, REFERENCE
 from tests.model.traditional.test_pipeline import Seen, psnr_db, restored_db, seen_by
 
-PIPELINE = TraditionalPipeline(
-    Sensor.load("pleiades-degraded").nominal(), Sensor.load("pleiades-reference").nominal()
-)
+PIPELINE = TraditionalPipeline(NOMINAL, REFERENCE)
 
 
 @pytest.fixture(scope="module")
 def pair(camera: Tensor) -> Seen:
-    return seen_by(camera, PIPELINE.degraded, PIPELINE.reference)
+    return seen_by(camera, NOMINAL, REFERENCE)
 
 
 @pytest.mark.parametrize("name", BASELINES)

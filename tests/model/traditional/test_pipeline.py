@@ -23,10 +23,14 @@ from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.instrument import Instrument, noise_from_snr
 from beers_deploy.profiles.response import PointSpread
 from beers_deploy.profiles.sensor import Sensor
-from tests.model.simulator.stages import formula_point, point_spread, with_response
+from tests.model.simulator.stages import (
+    NOMINAL,
+    REFERENCE,
+    formula_point,
+    point_spread,
+    with_response,
+)
 
-DEGRADED = Sensor.load("pleiades-degraded").nominal()
-REFERENCE = Sensor.load("pleiades-reference").nominal()
 ORDERS: tuple[Order, ...] = get_args(Order)
 NOISE_FREE = replace(REFERENCE, alpha=0.0, beta=0.0)
 
@@ -50,13 +54,13 @@ def seen_by(camera: Tensor, sensor: Instrument, reference: Instrument = NOISE_FR
 
 @pytest.fixture(scope="module")
 def pair(camera: Tensor) -> Seen:
-    return seen_by(camera, DEGRADED)
+    return seen_by(camera, NOMINAL)
 
 
 def psnr_db(image: Tensor, truth: Tensor) -> float:
     """Over the full scale, away from the border, where the scene beyond it is unknown."""
     difference = (image - truth)[8:-8, 8:-8].double()
-    return float(10 * torch.log10(DEGRADED.max_dn**2 / difference.square().mean()))
+    return float(10 * torch.log10(NOMINAL.max_dn**2 / difference.square().mean()))
 
 
 def restored_db(pair: Seen, pipeline: TraditionalPipeline) -> float:
@@ -64,10 +68,10 @@ def restored_db(pair: Seen, pipeline: TraditionalPipeline) -> float:
 
 
 ALPHA, BETA = noise_from_snr(25, 15, 100, 50)
-NOISY = replace(DEGRADED, mtf_nyquist=0.03, alpha=ALPHA, beta=BETA)
+NOISY = replace(NOMINAL, mtf_nyquist=0.03, alpha=ALPHA, beta=BETA)
 
 
-@pytest.mark.parametrize(("sensor", "gain_db"), [(DEGRADED, 12.9), (NOISY, 9.6)])
+@pytest.mark.parametrize(("sensor", "gain_db"), [(NOMINAL, 12.9), (NOISY, 9.6)])
 def test_both_orders_of_the_chain_gain_as_many_decibels_as_were_measured(
     sensor: Instrument, gain_db: float, camera: Tensor
 ) -> None:
@@ -91,7 +95,7 @@ def test_both_orders_of_the_chain_gain_as_many_decibels_as_were_measured(
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_strips_change_no_bit(order: Order, pair: Seen) -> None:
-    pipeline = TraditionalPipeline(DEGRADED, REFERENCE, "fast", order)
+    pipeline = TraditionalPipeline(NOMINAL, REFERENCE, "fast", order)
     dn = pair.degraded.clone()
     dn[:9, 20:50] = torch.nan
     fitted = pipeline.fitted_to(torch.split(dn, 31))
@@ -103,17 +107,17 @@ def test_strips_change_no_bit(order: Order, pair: Seen) -> None:
 
 def test_the_gain_of_each_sensor_is_its_own(pair: Seen) -> None:
     crop = pair.degraded[:37, :45]
-    same = restore_traditional(crop, TraditionalPipeline(DEGRADED, REFERENCE, "fast"))
+    same = restore_traditional(crop, TraditionalPipeline(NOMINAL, REFERENCE, "fast"))
     half = restore_traditional(
         crop,
-        TraditionalPipeline(DEGRADED, replace(REFERENCE, gain_dn_per_radiance=10.2375 / 2), "fast"),
+        TraditionalPipeline(NOMINAL, replace(REFERENCE, gain_dn_per_radiance=10.2375 / 2), "fast"),
     )
     torch.testing.assert_close(half * 2, same)
 
 
 @pytest.mark.parametrize("level", [0.0, 4095.0])
 @pytest.mark.parametrize(
-    "sensor", [DEGRADED, NOISE_FREE, Sensor.load("pleiades-variable").nominal()]
+    "sensor", [NOMINAL, NOISE_FREE, Sensor.load("pleiades-variable").nominal()]
 )
 def test_a_black_and_a_saturated_image(level: float, sensor: Instrument) -> None:
     restored = restore_traditional(
@@ -130,8 +134,8 @@ def leaning_disc() -> PointSpread:
 
 
 def test_the_chain_restores_a_point_spread_as_the_formula_it_was_made_of(camera: Tensor) -> None:
-    formula = replace(DEGRADED, mtf_nyquist=0.12, mtf_nyquist_along=0.05)
-    point = with_response(DEGRADED, formula_point(formula.mtf_axes, 2, 129, odd=True))
+    formula = replace(NOMINAL, mtf_nyquist=0.12, mtf_nyquist_along=0.05)
+    point = with_response(NOMINAL, formula_point(formula.mtf_axes, 2, 129, odd=True))
     levels_db = [
         restored_db(seen_by(camera, sensor), TraditionalPipeline(sensor, REFERENCE))
         for sensor in (formula, point)
@@ -139,10 +143,10 @@ def test_the_chain_restores_a_point_spread_as_the_formula_it_was_made_of(camera:
     assert levels_db[1] == pytest.approx(levels_db[0], abs=0.05)
 
 
-AXES = replace(DEGRADED, mtf_nyquist=0.12, mtf_nyquist_along=0.04)
+AXES = replace(NOMINAL, mtf_nyquist=0.12, mtf_nyquist_along=0.04)
 TURNED = replace(AXES, mtf_nyquist=0.04, mtf_nyquist_along=0.12)
-DISC = with_response(DEGRADED, leaning_disc())
-WRONG = [(DEGRADED, replace(DEGRADED, alpha=0.5), "denoise-first")]
+DISC = with_response(NOMINAL, leaning_disc())
+WRONG = [(NOMINAL, replace(NOMINAL, alpha=0.5), "denoise-first")]
 WRONG += [(AXES, TURNED, "denoise-first")]
 WRONG += [(DISC, replace(DISC, response=None), order) for order in ORDERS]
 """A sensor, and the one that the pipeline is given: the formula with the contrasts of a leaning
@@ -164,7 +168,7 @@ def test_the_wrong_sensor_costs_decibels(
 
 @pytest.mark.parametrize("name", ["wiener", "nl-means"])
 def test_baselines_undo_the_whole_response(name: str, camera: Tensor) -> None:
-    sensor = with_response(DEGRADED, leaning_disc())
+    sensor = with_response(NOMINAL, leaning_disc())
     pair = seen_by(camera, sensor)
     right, wrong = (
         psnr_db(
@@ -180,7 +184,7 @@ def test_any_bits_are_restored(bits: int, camera: Tensor) -> None:
     """Rounding to 8 bits counts as noise, and costs a decibel; 14 bits are as good as 12."""
     gain = (2**bits - 1) / 400
     degraded, reference = (
-        replace(s, bits=bits, gain_dn_per_radiance=gain) for s in (DEGRADED, NOISE_FREE)
+        replace(s, bits=bits, gain_dn_per_radiance=gain) for s in (NOMINAL, NOISE_FREE)
     )
     pair = seen_by(camera, degraded, reference)
     restored = restore_traditional(pair.degraded, TraditionalPipeline(degraded, reference))
@@ -193,10 +197,10 @@ def test_any_bits_are_restored(bits: int, camera: Tensor) -> None:
 
 def test_an_unknown_quality_is_refused() -> None:
     with pytest.raises(OptionError, match="fast, standard, best"):
-        restore_traditional(torch.ones(3, 3), TraditionalPipeline(DEGRADED, REFERENCE, "superb"))
+        restore_traditional(torch.ones(3, 3), TraditionalPipeline(NOMINAL, REFERENCE, "superb"))
 
 
 def test_the_result_stays_within_the_converter() -> None:
     checkerboard = torch.from_numpy(np.indices((29, 31)).sum(0) % 2 * 4095).float()
-    restored = restore_traditional(checkerboard, TraditionalPipeline(DEGRADED, REFERENCE, "fast"))
+    restored = restore_traditional(checkerboard, TraditionalPipeline(NOMINAL, REFERENCE, "fast"))
     assert 0 <= float(restored.min()) <= float(restored.max()) <= 4095

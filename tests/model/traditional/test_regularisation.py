@@ -29,10 +29,9 @@ from beers_deploy.model.traditional.regularisation import (
 )
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.instrument import Instrument
+from tests.model.simulator.stages import NOMINAL, REFERENCE
 from tests.model.traditional.test_pipeline import (
-    DEGRADED,
     NOISE_FREE,
-    REFERENCE,
     restored_db,
     seen_by,
 )
@@ -53,7 +52,7 @@ def walk(
     return torch.from_numpy(dn.clip(0, 4000).astype(np.float32))
 
 
-def epsilon_of(strips: Sequence[Tensor], sensor: Instrument = DEGRADED) -> float:
+def epsilon_of(strips: Sequence[Tensor], sensor: Instrument = NOMINAL) -> float:
     return derived_epsilon(measure(strips, sensor), sensor)
 
 
@@ -69,12 +68,10 @@ def test_strips_of_any_height_give_the_same_bits(
 
 def test_the_means_are_those_of_numpy() -> None:
     dn = walk((8 * BLOCK_PX, 7 * BLOCK_PX), step_dn=300.0)
-    statistics = measure(torch.split(dn, 5), DEGRADED)
-    radiance = dn.double().numpy() / DEGRADED.gain_dn_per_radiance
+    statistics = measure(torch.split(dn, 5), NOMINAL)
+    radiance = dn.double().numpy() / NOMINAL.gain_dn_per_radiance
     noise = (
-        DEGRADED.alpha * radiance.mean()
-        + DEGRADED.beta
-        + 1 / (12 * DEGRADED.gain_dn_per_radiance**2)
+        NOMINAL.alpha * radiance.mean() + NOMINAL.beta + 1 / (12 * NOMINAL.gain_dn_per_radiance**2)
     )
     squares = [float(np.square(np.diff(radiance, axis=axis)).mean()) for axis in (0, 1)]
     assert statistics.noise == pytest.approx(noise, rel=1e-9)
@@ -88,24 +85,24 @@ def test_the_means_are_those_of_numpy() -> None:
 def test_epsilon_grows_with_the_noise_and_falls_with_the_contrast(seed: int, times: float) -> None:
     dn = walk((31, 43), seed, step_dn=300.0)
     usual = epsilon_of([dn])
-    noisier = replace(DEGRADED, alpha=DEGRADED.alpha * times, beta=DEGRADED.beta * times)
+    noisier = replace(NOMINAL, alpha=NOMINAL.alpha * times, beta=NOMINAL.beta * times)
     assert epsilon_of([dn], noisier) > usual
     flatter = dn.mean() + (dn - dn.mean()) / times
     assert epsilon_of([flatter]) > usual
     # Equal differences that a sharper sensor sees mean a fainter scene.
-    assert epsilon_of([dn], replace(DEGRADED, mtf_nyquist=0.2)) > usual
+    assert epsilon_of([dn], replace(NOMINAL, mtf_nyquist=0.2)) > usual
 
 
 @given(seed=SEEDS, factor=st.floats(0.1, 10))
 def test_a_change_of_the_unit_of_radiance_leaves_epsilon(seed: int, factor: float) -> None:
     """Radiance and noise scale together: the same digital numbers, of a sensor of another gain."""
     dn = walk((25, 37), seed)
-    gain = DEGRADED.gain_dn_per_radiance / factor
+    gain = NOMINAL.gain_dn_per_radiance / factor
     scaled = replace(
-        DEGRADED,
+        NOMINAL,
         gain_dn_per_radiance=gain,
-        alpha=DEGRADED.alpha * factor,
-        beta=DEGRADED.beta * factor**2,
+        alpha=NOMINAL.alpha * factor,
+        beta=NOMINAL.beta * factor**2,
     )
     assert epsilon_of([dn], scaled) == pytest.approx(epsilon_of([dn]), rel=1e-9)
 
@@ -137,7 +134,7 @@ EMPTY += [torch.full((1, 19), 700.0), torch.full((13, 21), 0.0), torch.zeros(0, 
 
 
 @pytest.mark.parametrize("dn", EMPTY)
-@pytest.mark.parametrize("sensor", [DEGRADED, NOISE_FREE, replace(DEGRADED, mtf_nyquist=1e-3)])
+@pytest.mark.parametrize("sensor", [NOMINAL, NOISE_FREE, replace(NOMINAL, mtf_nyquist=1e-3)])
 def test_images_without_contrast_get_a_finite_epsilon(dn: Tensor, sensor: Instrument) -> None:
     assert 0 < epsilon_of([dn], sensor) <= LARGEST_EPSILON
 
@@ -146,18 +143,18 @@ def test_images_without_contrast_get_a_finite_epsilon(dn: Tensor, sensor: Instru
 def test_epsilon_is_bounded_by_the_share_of_noise(seed: int, mean_dn: float) -> None:
     """So that faint patterns near Nyquist are not erased: see `LARGEST_PER_NOISE`."""
     dn = walk((23, 31), seed, step_dn=1.0, mean_dn=mean_dn)
-    statistics = measure([dn], DEGRADED)
+    statistics = measure([dn], NOMINAL)
     share = float(statistics.noise) ** 0.5 / statistics.radiance
     assert epsilon_of([dn]) <= max(LARGEST_PER_NOISE * share, 0) + 1e-12
 
 
 def test_infinite_pixels_are_refused() -> None:
     with pytest.raises(ImageError, match="infinity"):
-        TraditionalPipeline(DEGRADED, REFERENCE).fitted_to([torch.full((3, 3), torch.inf)])
+        TraditionalPipeline(NOMINAL, REFERENCE).fitted_to([torch.full((3, 3), torch.inf)])
 
 
 def test_strips_need_an_epsilon_and_one_that_is_given_stays() -> None:
-    pipeline = TraditionalPipeline(DEGRADED, REFERENCE)
+    pipeline = TraditionalPipeline(NOMINAL, REFERENCE)
     dn = walk((9, 9))
     with pytest.raises(OptionError, match="fitted_to"):
         list(restore_strips([dn], 9, pipeline))
@@ -176,20 +173,20 @@ def test_the_restored_mtf_comes_near_that_of_the_reference() -> None:
 def restored_mtf(angle_deg: float, number: int) -> float:
     """Return the MTF at Nyquist of a slanted edge that the pipeline restored."""
     scene = slanted_edge(240, 5, angle_deg)
-    edge = acquire(prepare_scene(scene, 5), DEGRADED, Draw(0, number), margin_px=0)
+    edge = acquire(prepare_scene(scene, 5), NOMINAL, Draw(0, number), margin_px=0)
     restored = restore_traditional(
-        torch.from_numpy(edge), TraditionalPipeline(DEGRADED, REFERENCE)
+        torch.from_numpy(edge), TraditionalPipeline(NOMINAL, REFERENCE)
     ).numpy()
-    mtf = edge_mtf(restored[80:160, 80:160], angle_deg, DEGRADED.max_dn)
+    mtf = edge_mtf(restored[80:160, 80:160], angle_deg, NOMINAL.max_dn)
     assert isinstance(mtf, float)
     return mtf
 
 
 def test_a_dark_scene_gets_more_regularisation_and_gains_from_it(camera: Tensor) -> None:
     """At 1/20 of the radiance what suits the bright scene loses, and the other way round."""
-    reference = replace(NOISE_FREE, gain_dn_per_radiance=DEGRADED.gain_dn_per_radiance)
-    bright, dark = (seen_by(camera * share, DEGRADED, reference) for share in (1, 1 / 20))
-    pipeline = TraditionalPipeline(DEGRADED, REFERENCE)
+    reference = replace(NOISE_FREE, gain_dn_per_radiance=NOMINAL.gain_dn_per_radiance)
+    bright, dark = (seen_by(camera * share, NOMINAL, reference) for share in (1, 1 / 20))
+    pipeline = TraditionalPipeline(NOMINAL, REFERENCE)
     for_bright, for_dark = (pipeline.fitted_to([view.degraded]) for view in (bright, dark))
     assert for_bright.epsilon is not None
     assert for_dark.epsilon is not None

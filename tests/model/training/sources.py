@@ -11,6 +11,7 @@ from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.training.patches import PatchRecipe
 from beers_deploy.model.training.source import PatchSource
 from beers_deploy.profiles.sensor import Sensor
+from tests.model.simulator.stages import NOMINAL
 
 
 @cache
@@ -32,7 +33,7 @@ def source(
         Sensor.load("pleiades-variable"), Sensor.load("pleiades-reference"), patch_px=patch_px
     )
     if conditioned:
-        recipe = replace(recipe, family=SensorFamily(Sensor.load("pleiades-degraded").nominal()))
+        recipe = replace(recipe, family=SensorFamily(NOMINAL))
     return PatchSource(
         [scene or small_scene()], recipe, batch=3, seed=seed, rank=rank, workers=workers
     )

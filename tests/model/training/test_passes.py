@@ -25,10 +25,8 @@ from beers_deploy.model.training.passes import (
 )
 from beers_deploy.profiles.effects import AntiAlias, Offset, Smear
 from beers_deploy.profiles.instrument import Instrument
-from beers_deploy.profiles.sensor import Sensor
-from tests.model.simulator.stages import lopsided_point, with_response
+from tests.model.simulator.stages import NOMINAL, lopsided_point, with_response
 
-NOMINAL = Sensor.load("pleiades-degraded").nominal()
 PLAIN = Look(1.0)
 
 

@@ -24,10 +24,8 @@ from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import MtfTable
 from beers_deploy.profiles.sensor import Sensor
-from tests.model.simulator.stages import point_spread, with_response
+from tests.model.simulator.stages import NOMINAL, point_spread, with_response
 from tests.model.training.sources import small_scene, source
-
-NOMINAL = Sensor.load("pleiades-degraded").nominal()
 
 
 def test_the_same_seed_gives_the_same_batches_from_anywhere() -> None:
