@@ -6,7 +6,7 @@ the end of their names, or used in the order given.
 
 import logging
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -145,6 +145,26 @@ def in_order(items: Mapping[str, Each], raster: Raster) -> list[Each]:
             "scope."
         )
     return [items[name] for name in names]
+
+
+def by_band(
+    sensors: Mapping[str, Sensor], raster: Raster, build: Callable[[Sensor], Each]
+) -> tuple[Each, ...]:
+    """Build something for the sensor of each band, in the order of the bands.
+
+    Args:
+        sensors: the sensor by the name of the band; a sensor for all bands has the key "".
+        raster: the description of the image.
+        build: called once for each sensor.
+
+    Returns:
+        One item for each band of the image, the same for all bands of one sensor.
+
+    Raises:
+        OptionError: the sensors are not those of the image's bands.
+    """
+    built = tuple(build(sensor) for sensor in in_order(sensors, raster))
+    return built * (raster.bands // len(built))
 
 
 def _by_number(names: Collection[str]) -> Collection[str]:

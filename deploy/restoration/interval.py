@@ -20,7 +20,7 @@ from beers_deploy.network import Network
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.quant.onnx_file import metadata
-from beers_deploy.restoration.bands import in_order
+from beers_deploy.restoration.bands import by_band
 from beers_deploy.restoration.prepare import Restoration
 from beers_deploy.restoration.self_check import ReadRows
 
@@ -116,11 +116,8 @@ def half_widths_of(work: Restoration, level: Level) -> tuple[HalfWidth, ...]:
         )
     # The networks of several bands are one file, conditioned on their sensors.
     interval = interval_of(work.networks[0])
-    built = [
-        interval.for_sensor(sensor.nominal(), work.scale.value, level)
-        for sensor in in_order(sensors, raster)
-    ]
-    return tuple(built[band % len(built)] for band in range(raster.bands))
+    full_scale = work.scale.value
+    return by_band(sensors, raster, lambda s: interval.for_sensor(s.nominal(), full_scale, level))
 
 
 def interval_beside(out: Path) -> Path:

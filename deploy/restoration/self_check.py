@@ -31,7 +31,7 @@ from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.figures import Figure, measured
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND
-from beers_deploy.restoration.bands import in_order
+from beers_deploy.restoration.bands import by_band
 
 ROWS_PX = 4 * BLOCK_PX
 COLUMNS_PX = 32 * BLOCK_PX
@@ -138,14 +138,13 @@ def checks_of(
     """
     if tuple(out_shape) != raster.shape or not sensors:
         return {}
-    # The sensors of all bands may be one, whose check is built once.
-    built = [
-        None
-        if sensor.name == BLIND
-        else SelfCheck.of(sensor.nominal(), sensor.reference.nominal(), full_scale)
-        for sensor in in_order(sensors, raster)
-    ]
-    checks = ((band, built[band % len(built)]) for band in range(raster.bands))
+
+    def check_for(sensor: Sensor) -> SelfCheck | None:
+        if sensor.name == BLIND:
+            return None
+        return SelfCheck.of(sensor.nominal(), sensor.reference.nominal(), full_scale)
+
+    checks = enumerate(by_band(sensors, raster, check_for))
     return {band: check for band, check in checks if check is not None}
 
 
