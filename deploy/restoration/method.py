@@ -17,7 +17,7 @@ from beers_deploy.quant.tiling.receptive_field import tiling_of
 from beers_deploy.restoration.plan import Plan, make_plan
 from beers_deploy.restoration.runtime import AtFirstCall, open_runtime
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
-from beers_deploy.restoration.tiles.rows import restore_dn
+from beers_deploy.restoration.tiles.rows import restore_floats
 
 Restore = Callable[[np.ndarray], np.ndarray]
 """Maps degraded digital numbers (H, W) float32 to restored ones."""
@@ -68,6 +68,6 @@ def network_method(
 
     def restore(dn: np.ndarray) -> np.ndarray:
         plan = (plan_of or default_plan)(dn.shape)
-        return restore_dn(dn, network, plan, max_dn, consistency)
+        return np.asarray(np.rint(restore_floats(dn, network, plan, max_dn, consistency)))
 
     return restore

@@ -71,6 +71,15 @@ class Span:
     keep_start: int
     keep_stop: int
 
+    def keep_slice(self, origin: int = 0, scale: int = 1) -> slice:
+        """Return the retained part as a slice of an array.
+
+        Args:
+            origin: the pixel of the image at which the array begins.
+            scale: the number of pixels of the array per pixel of the image.
+        """
+        return slice((self.keep_start - origin) * scale, (self.keep_stop - origin) * scale)
+
 
 class TilePlace(NamedTuple):
     """The place of a tile in an image.

@@ -17,11 +17,10 @@ from beers_deploy.model.progress import Steps, steps
 from beers_deploy.model.raster.source import Source, strips
 from beers_deploy.model.traditional.pipeline import TraditionalPipeline, restore_strips
 from beers_deploy.profiles.figures import Figure
-from beers_deploy.restoration.bands import in_order
+from beers_deploy.restoration.bands import by_band
 from beers_deploy.restoration.cluster import Cluster
 from beers_deploy.restoration.memory import check_memory
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.plan import Span
 from beers_deploy.restoration.prepare import Restoration, check_sensor
 from beers_deploy.restoration.radiometry import Reading, full_scale_of
 from beers_deploy.restoration.runtime import Engine
@@ -150,7 +149,7 @@ class TraditionalRestoration(Restoration):
             valid,
             valid,
         )
-        return RestoredRow(Span(top, stop, top, stop), pixels, tally)
+        return RestoredRow(pixels, tally)
 
 
 def _counted(strips_read: Iterator[Tensor], bar: Steps) -> Iterator[Tensor]:
@@ -187,8 +186,7 @@ class TraditionalMethod:
         describes. The regularisation is fitted here, which reads the whole image.
         """
         raster = source.raster
-        sensors = in_order(reading.sensors, raster)
-        sensors *= raster.bands // len(sensors)
+        sensors = by_band(reading.sensors, raster, lambda sensor: sensor)
         needed = (
             FIXED_BYTES
             + BYTES_PER_COLUMN * raster.width_px * raster.bands

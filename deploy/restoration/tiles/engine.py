@@ -135,9 +135,8 @@ class Restorer:
             # The network would restore nothing but what fills missing pixels.
             return Tile(np.full(missing.shape, np.nan, np.float32), Tally())
         network = self.networks[place.group % len(self.networks)]
-        inner = _within(place.rows), _within(place.columns)
         window = self._window(strip, place)
-        restored = network.restore(window, self.full_scale, inner, self.plan.tiling)
+        restored = network.restore(window, self.full_scale, place[1:], self.plan.tiling)
         tally = Tally(tiles=1, runs=restored.runs, brightened=restored.brightened)
         pixels = restored.pixels
         if missing is not None:
@@ -166,10 +165,7 @@ class Restorer:
         if missing is not None and missing.all():
             return Tile(self._unrestored(raw, missing), Tally())
         down, across = (
-            slice(
-                (span.keep_start - start) * self.plan.scale,
-                (span.keep_stop - start) * self.plan.scale,
-            )
+            span.keep_slice(start, self.plan.scale)
             for span, start in zip(place[1:], at, strict=True)
         )
         valid_raw = None if strip.missing is None else ~strip.missing[window]
@@ -225,10 +221,11 @@ class Restorer:
 
     def _retained(self, strip: Strip, place: TilePlace) -> Window:
         """Return the window of a strip's arrays that contains the retained part of a tile."""
-        down = slice(place.rows.keep_start - strip.top, place.rows.keep_stop - strip.top)
-        columns = place.columns
-        across = slice(columns.keep_start - strip.left, columns.keep_stop - strip.left)
-        return self._bands(place), down, across
+        return (
+            self._bands(place),
+            place.rows.keep_slice(strip.top),
+            place.columns.keep_slice(strip.left),
+        )
 
     def _missing(self, strip: Strip, place: TilePlace) -> np.ndarray | None:
         """Return a mask of the restored pixels of a tile that are missing, (bands, h, w), or None
@@ -290,10 +287,6 @@ class Restorer:
 def _enlarged(planes: np.ndarray, scale: int) -> np.ndarray:
     """Return (bands, h, w) with each pixel repeated `scale` times along both sides."""
     return planes if scale == 1 else planes.repeat(scale, axis=1).repeat(scale, axis=2)
-
-
-def _within(span: Span) -> slice:
-    return slice(span.keep_start - span.start, span.keep_stop - span.start)
 
 
 def checked_strip(

@@ -11,11 +11,8 @@ from beers_deploy.model.exposure import choose_factors
 from beers_deploy.profiles.errors import ImageError, ModelError
 from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.quant.untrusted import times
-from beers_deploy.restoration.plan import Plan
+from beers_deploy.restoration.plan import Plan, Span
 from beers_deploy.restoration.runtime import Infer
-
-Inner = tuple[slice, slice]
-"""The rows and columns of a window that are retained."""
 
 
 class Exposed(NamedTuple):
@@ -55,14 +52,14 @@ class ExposedNetwork:
     offset: float = 0.0
 
     def restore(
-        self, window: np.ndarray, full_scale: float, inner: Inner, tiling: Tiling
+        self, window: np.ndarray, full_scale: float, spans: tuple[Span, Span], tiling: Tiling
     ) -> Exposed:
         """Restore the window of one tile at each factor that its retained pixels need.
 
         Args:
             window: pixel values (bands, h, w), none missing; one band if there are several factors.
             full_scale: the pixel value that is 1.0 to the network.
-            inner: the rows and columns of the window that are retained.
+            spans: the rows and columns of the image that the window reads and retains.
             tiling: the network's tiling geometry.
 
         Raises:
@@ -70,7 +67,7 @@ class ExposedNetwork:
             ImageError: the network returns NaN or infinite values.
         """
         scale = int(tiling.scale)
-        inside = (slice(None), *(slice(part.start * scale, part.stop * scale) for part in inner))
+        down, across = (span.keep_slice(span.start, scale) for span in spans)
         if len(self.infers) == 1:
             restored = restore_window(window, self.infers[1], full_scale)
             shape = tiling.channels_out, *(side * scale for side in window.shape[1:])
@@ -79,14 +76,16 @@ class ExposedNetwork:
                     f"The network returned a result of {times(restored.shape)}, but its file "
                     f"states {times(shape)}. Export it for images of any size, or check its sizes."
                 )
-            return Exposed(restored[inside], 1, 0)
+            return Exposed(restored[:, down, across], 1, 0)
         image = np.asarray(window[0], np.float32)
         rising = sorted(self.infers)
-        choice = choose_factors(image, rising, self.radius_px, full_scale, self.offset)[inner]
+        choice = choose_factors(image, rising, self.radius_px, full_scale, self.offset)
+        # Only a network that returns one pixel for each pixel has several factors.
+        choice = choice[down, across]
         pixels = np.zeros((1, *choice.shape), np.float32)
         factors = np.unique(choice).tolist()
         for factor in factors:
-            restored = self._at(factor, image, full_scale)[inside]
+            restored = self._at(factor, image, full_scale)[:, down, across]
             pixels = np.where(choice == factor, restored, pixels)
         return Exposed(pixels, len(factors), int((choice > 1).sum()))
 
@@ -127,8 +126,7 @@ def tiles_by_factor(
     choice = choose_factors(pixels, factors, plan.tiling.halo_px, full_scale, offset)
     counts = dict.fromkeys(factors, 0)
     for row, column in product(plan.rows, plan.columns):
-        tile_choice = choice[row.keep_start : row.keep_stop, column.keep_start : column.keep_stop]
-        for factor in np.unique(tile_choice).tolist():
+        for factor in np.unique(choice[row.keep_slice(), column.keep_slice()]).tolist():
             counts[factor] += 1
     return counts
 

@@ -4,7 +4,7 @@ it.
 A `Source` provides a strip of rows, `Restorer.tile` runs the network on one tile of it, and
 `Restorer.finish` applies the consistency step once the tiles around are available. `restore_rows`
 yields finished rows of tiles in order: the next strip is read ahead, and several tiles are in work
-at a time. `gathered`, `restore_floats` and `restore_dn` gather the rows of an image in memory.
+at a time. `gathered` and `restore_floats` gather the rows of an image in memory.
 `restoration.run` writes those of a file.
 """
 
@@ -40,12 +40,10 @@ class RestoredRow(NamedTuple):
     """A finished row of tiles, or a strip of the traditional pipeline, with all bands.
 
     Attributes:
-        span: the rows of the raw image that the tiles read and retain.
         pixels: the restored pixels (bands, rows, width) as they are stored.
         tally: counts and sums over these pixels and their raw ones.
     """
 
-    span: Span
     pixels: np.ndarray
     tally: Tally
 
@@ -223,7 +221,7 @@ def _finished(row: NetworkRow, buffer: HeldRows, restorer: Restorer, pool: Execu
     pixels = np.empty(row.pixels.shape, restorer.raster.out_dtype)
     tiles = pool.map(finish, plan.places(row.span))
     tally = row.tally + _gathered(tiles, pixels, plan, row.span, lambda: None)
-    return RestoredRow(row.span, pixels, tally)
+    return RestoredRow(pixels, tally)
 
 
 def _gathered(
@@ -235,7 +233,7 @@ def _gathered(
     tally = Tally()
     count = plan.tiling.channels_out
     for (group, _, columns), tile in zip(plan.places(row), tiles, strict=True):
-        across = slice(columns.keep_start * plan.scale, columns.keep_stop * plan.scale)
+        across = columns.keep_slice(scale=plan.scale)
         pixels[group * count : (group + 1) * count, :, across] = tile.pixels
         tally += tile.tally
         tick()
@@ -306,33 +304,3 @@ def restore_floats(
     rows = restore_rows(ArraySource(pixels, raster), restorer, plan.rows, lambda: None)
     restored, _ = gathered(rows, plan.out_shape, raster.out_dtype)
     return np.asarray(restored[0])
-
-
-def restore_dn(
-    dn: np.ndarray,
-    network: Infer | ExposedNetwork,
-    plan: Plan,
-    max_dn: float = MAX_DN,
-    consistency: Steps = (),
-) -> np.ndarray:
-    """Restore an image of one band in memory, to integers in float32.
-
-    The pixels are those that `restore` writes for an image of integers.
-
-    Args:
-        dn: digital numbers (H, W) of 0 to `max_dn`. NaN is a missing pixel, and stays NaN.
-        network: a function that runs the network, or an `ExposedNetwork`, which has further
-            versions of it for dark pixels.
-        plan: how the image is cut into tiles.
-        max_dn: the largest digital number, which is 1.0 to the network; by default that of 12 bits.
-        consistency: the step that makes the result agree with the raw image at low spatial
-            frequencies, as a tuple of one; empty to omit it.
-
-    Returns:
-        Restored digital numbers (H, W), whole numbers in float32.
-
-    Raises:
-        ModelError: the network returns another number of bands or another size than the image's.
-        ImageError: a value is below 0 or above `max_dn`.
-    """
-    return np.asarray(np.rint(restore_floats(dn, network, plan, max_dn, consistency)))

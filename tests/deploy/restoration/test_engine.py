@@ -17,7 +17,7 @@ from beers_deploy.restoration.plan import Plan, make_plan
 from beers_deploy.restoration.runtime import AT_ONCE, Infer, session_threads, tiles_at_once
 from beers_deploy.restoration.tiles.engine import Restorer
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
-from beers_deploy.restoration.tiles.rows import restore_rows
+from beers_deploy.restoration.tiles.rows import gathered, restore_rows
 
 SHAPE = (2, 75, 133)
 TILE_PX = 32
@@ -30,11 +30,9 @@ def running(infer: Infer, at_once: int, tick: Callable[[], None] = lambda: None)
     raster = Raster(*SHAPE, pixels.dtype, None)
     plan: Plan = make_plan(raster.shape, TILE_PX, RADIUS_PX, Tiling(RADIUS_PX))
     restorer = Restorer(raster, (ExposedNetwork({1: infer}),), 4095.0, plan)
-    result = np.empty(SHAPE, np.uint16)
-    source = ArraySource(pixels, raster)
-    for row, pixels_out, tally in restore_rows(source, restorer, plan.rows, tick, at_once):
-        assert (tally.valid_results, tally.clipped) == (pixels_out.size, 0)
-        result[:, row.keep_start : row.keep_stop] = pixels_out
+    rows = restore_rows(ArraySource(pixels, raster), restorer, plan.rows, tick, at_once)
+    result, tally = gathered(rows, SHAPE, pixels.dtype)
+    assert (tally.valid_results, tally.clipped) == (result.size, 0)
     return result
 
 

@@ -9,7 +9,6 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +21,6 @@ from beers_deploy.network import Network
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.plan import Span
 from beers_deploy.restoration.tiles.engine import Restorer
 from beers_deploy.restoration.tiles.rows import RestoredRow
 from beers_deploy.verbs.restore import restore
@@ -54,9 +52,7 @@ def rows_of(pixels: np.ndarray, heights: list[int]) -> Iterator[RestoredRow]:
     top = 0
     for height in heights:
         part = pixels[:, top : top + height]
-        yield RestoredRow(
-            Span(top, top + height, top, top + height), part, Tally(valid_results=part.size)
-        )
+        yield RestoredRow(part, Tally(valid_results=part.size))
         top += height
 
 
@@ -159,10 +155,10 @@ def test_whatever_is_read_is_part_of_the_job(
 ) -> None:
     """Also where a file has the same size and time as before."""
     out = tmp_path / "out.tif"
-    options: dict[str, Any] = {"network": model, "tile": TILE_PX}
+    run = partial(restore, network=model, tile=TILE_PX)
     before(image)
     with stopped_after(40):
-        restore(image, out, **options)
+        run(image, out)
     file = tmp_path / name
     stat = file.stat()
     content = file.read_bytes()
@@ -170,12 +166,12 @@ def test_whatever_is_read_is_part_of_the_job(
     assert file.stat().st_size == stat.st_size
     os.utime(file, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     with pytest.raises(OptionError, match="the image, the model and the options"):
-        restore(image, out, **options, resume=True)
+        run(image, out, resume=True)
     assert not out.exists()
     file.write_bytes(content)
     os.utime(file, ns=(stat.st_atime_ns, stat.st_mtime_ns))
-    restore(image, out, **options, resume=True)
-    restore(image, tmp_path / "whole.tif", **options)
+    run(image, out, resume=True)
+    run(image, tmp_path / "whole.tif")
     assert out.read_bytes() == (tmp_path / "whole.tif").read_bytes()
 
 

@@ -14,8 +14,8 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration import method
 from beers_deploy.restoration.plan import Tiles, plan_for
 from beers_deploy.restoration.runtime import open_runtime
-from beers_deploy.restoration.steps import Around, step_for
-from beers_deploy.restoration.tiles.rows import restore_dn
+from beers_deploy.restoration.steps import step_for
+from beers_deploy.restoration.tiles.rows import restore_floats
 from beers_deploy.studies.evaluation.methods import method_named
 from beers_deploy.studies.stress.networks import Runner
 from beers_deploy.studies.tradeoff.measure import restore_in_tiles
@@ -52,58 +52,42 @@ def image() -> np.ndarray:
     return np.random.default_rng(2).integers(0, 4096, ODD).astype(np.uint16)
 
 
-def by_engine(dn: np.ndarray, path: Path, tiles: Tiles, sensor: Sensor | None = None) -> np.ndarray:
-    """Restore an array by the engine itself, with the consistency step if the sensor is known."""
+def ways(path: Path, tile_px: int, halo_px: int) -> Mapping[str, Restored]:
+    """Return each way from digital numbers (H, W) float32 to restored integers, for a known sensor
+    and with a halo.
+    """
     network = bd.Network.load(path)
+    variant = Variant(path.stem, INT8 if network.precision == "int8" else FLOAT, network)
+    point = Point(variant, tile_px=tile_px, halo_px=halo_px)
+    plan = plan_for(network, (1, *ODD), Tiles(tile_px, str(halo_px)))
     infer, _ = open_runtime("onnxruntime", network.model, threads=0)
-    steps = () if sensor is None else (step_for(sensor, 4095),)
-    return restore_dn(dn, infer, plan_for(network, (1, *ODD), tiles), consistency=steps)
-
-
-def exact_ways(path: Path, tile_px: int) -> Mapping[str, Restored]:
-    """Return each way with exact seams from digital numbers (H, W) float32 to restored integers."""
-    runner = Runner(bd.Network.load(path))
+    steps = (step_for(SENSOR, 4095),)
     return {
-        "evaluate and tradeoff": method_named(
-            str(path), SENSOR, REFERENCE, around=Around(consistency=False)
-        ).restore,
-        "the library and the demo": lambda dn: np.rint(
-            restore(dn, network=path, tile=tile_px, full_scale=4095)
+        "the library and the demo": partial(
+            restore, network=path, tile=tile_px, halo=halo_px, sensor=SENSOR
         ),
-        "stress": lambda dn: np.rint(runner.restore(dn, tile_px=tile_px)),
-        "the engine": partial(by_engine, path=path, tiles=Tiles(tile_px)),
+        "tradeoff": restore_in_tiles(point, SENSOR, REFERENCE),
+        "the engine": lambda dn: restore_floats(dn, infer, plan, consistency=steps),
     }
 
 
-def test_with_exact_seams_every_command_gives_the_pixels_of_restore(
-    precision: str, path: Path, tmp_path: Path
+@pytest.mark.parametrize("is_exact", [True, False])
+def test_every_command_gives_the_pixels_of_restore(
+    is_exact: bool, precision: str, path: Path, tmp_path: Path
 ) -> None:
+    """With exact seams, and with a halo below the radius, which shows seams."""
     pixels = image()
-    tile_px = TILES_PX[precision]
-    expected = restored(tmp_path, pixels, network=path, tile=tile_px)[0]
-    assert (expected != pixels).mean() > 0.5
-    assert_array_equal(restore(pixels, network=path, tile=tile_px), expected)
-    for name, way in exact_ways(path, tile_px).items():
-        assert_array_equal(way(pixels.astype(np.float32)), expected, err_msg=name)
-
-
-def test_with_a_halo_below_the_radius_they_have_the_same_seams(
-    precision: str, path: Path, tmp_path: Path
-) -> None:
-    pixels = image()
-    tile_px = TILES_PX[precision]
-    halo_px = SMALL_HALOS_PX[precision]
-    options: dict[str, Any] = {"network": path, "tile": tile_px, "sensor": SENSOR}
-    expected = restored(tmp_path, pixels, **options, halo=halo_px)[0]
-    exact = restored(tmp_path, pixels, **options)[0]
-    assert (expected != exact).any()
     dn = pixels.astype(np.float32)
-    result = restore(pixels, **options, halo=halo_px)
-    assert_array_equal(result, expected)
-    # A trade-off study scores an operating point whose halo is below the network's radius this way.
-    variant = Variant(path.stem, FLOAT if precision == "float" else INT8, bd.Network.load(path))
-    point = Point(variant, tile_px=tile_px, halo_px=halo_px)
-    by_tradeoff = restore_in_tiles(point, SENSOR, REFERENCE)
-    assert_array_equal(by_tradeoff(dn), expected)
-    tiles = Tiles(tile_px, str(halo_px))
-    assert_array_equal(by_engine(dn, path, tiles, SENSOR), expected)
+    network = bd.Network.load(path)
+    halo_px = network.tiling.halo_px if is_exact else SMALL_HALOS_PX[precision]
+    options: dict[str, Any] = {"network": path, "tile": TILES_PX[precision], "sensor": SENSOR}
+    expected = restored(tmp_path, pixels, **options, halo=halo_px)[0]
+    assert (expected != pixels).mean() > 0.5
+    assert_array_equal(restore(pixels, **options, halo=halo_px), expected)
+    for name, way in ways(path, TILES_PX[precision], halo_px).items():
+        assert_array_equal(np.rint(way(dn)), expected, err_msg=name)
+    exact = method_named(str(path), SENSOR, REFERENCE).restore(dn)
+    assert np.array_equal(exact, expected) == is_exact
+    without = restored(tmp_path, pixels, **options, consistency=False)[0]
+    by_stress = Runner(network).restore(dn, tile_px=TILES_PX[precision])
+    assert_array_equal(np.rint(by_stress), without)
