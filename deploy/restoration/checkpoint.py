@@ -38,13 +38,11 @@ class FinishedRow:
 
     Attributes:
         rows_px: the height of the row of tiles in pixels, the same for each band.
-        size_bytes: the size of the pixels of all bands in bytes.
-        sha256: the hex digest of these bytes, band after band.
+        sha256: the hex digest of the pixels of all bands, band after band.
         tally: counts and sums over these pixels and their raw ones.
     """
 
     rows_px: int
-    size_bytes: int
     sha256: str
     tally: Tally
 
@@ -56,11 +54,7 @@ def journal_text(job: Mapping[str, object], finished: Sequence[FinishedRow]) -> 
         job: all parameters that determine the pixels, by name.
         finished: the stored rows of tiles, from the top.
     """
-    content = {
-        "job": job,
-        "rows": sum(row.rows_px for row in finished),
-        "finished": [asdict(row) for row in finished],
-    }
+    content = {"job": job, "finished": [asdict(row) for row in finished]}
     return json.dumps(content | {"sha256": _digest(content)})
 
 
@@ -166,9 +160,7 @@ class Checkpoint:
                 # After a power cut, the rows that the journal counts must be on the disk.
                 os.fsync(stream.fileno())
             rows_px = row.pixels.shape[1]
-            self._finished.append(
-                FinishedRow(rows_px, row.pixels.nbytes, digest.hexdigest(), row.tally)
-            )
+            self._finished.append(FinishedRow(rows_px, digest.hexdigest(), row.tally))
             self.rows += rows_px
             self.tally += row.tally
             self._write_journal()
@@ -240,25 +232,22 @@ class Checkpoint:
         matching = list[FinishedRow]()
         top = 0
         for row in finished:
-            if self._stored(top, row.rows_px) != (row.size_bytes, row.sha256):
+            if self._stored_sha256(top, row.rows_px) != row.sha256:
                 break
             matching.append(row)
             top += row.rows_px
         return matching
 
-    def _stored(self, top: int, rows_px: int) -> tuple[int, str]:
-        """Return the size in bytes and the digest of `rows_px` stored rows from row `top` on. The
-        size is smaller than that of the rows if the file ends before them.
+    def _stored_sha256(self, top: int, rows_px: int) -> str:
+        """Return the digest of `rows_px` stored rows from row `top` on, or of as many of them as
+        the file has.
         """
-        size_bytes = 0
         digest = hashlib.sha256()
         with suppress(OSError), (self.folder / "rows.raw").open("rb") as stream:
             for band in range(self.shape[0]):
                 stream.seek(self._offset(band, top))
-                pixels = stream.read(rows_px * self.shape[2] * self.dtype.itemsize)
-                size_bytes += len(pixels)
-                digest.update(pixels)
-        return size_bytes, digest.hexdigest()
+                digest.update(stream.read(rows_px * self.shape[2] * self.dtype.itemsize))
+        return digest.hexdigest()
 
     def _write_journal(self) -> None:
         path = self.folder / "journal.json"

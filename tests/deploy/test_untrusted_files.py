@@ -96,9 +96,7 @@ def test_an_array_larger_than_its_archive_is_refused(tmp_path: Path) -> None:
 def stored_rows(rows_px: int = 4, **counts: int) -> tuple[bytes, FinishedRow]:
     """Return rows of pixels as a checkpoint stores them, and their line in its journal."""
     pixels = np.arange(rows_px * SHAPE[2], dtype=np.uint16).tobytes()
-    return pixels, FinishedRow(
-        rows_px, len(pixels), hashlib.sha256(pixels).hexdigest(), Tally(**counts)
-    )
+    return pixels, FinishedRow(rows_px, hashlib.sha256(pixels).hexdigest(), Tally(**counts))
 
 
 ENDS = (4, SHAPE[1])

@@ -165,7 +165,7 @@ def document_seeds(_: Path) -> list[bytes]:
 
 
 def journal_seeds(_: Path) -> list[bytes]:
-    row = FinishedRow(4, 64, "0" * 64, Tally())
+    row = FinishedRow(4, "0" * 64, Tally())
     return [journal_text(JOB, [row]).encode(), journal_text(JOB, []).encode()]
 
 
