@@ -91,23 +91,6 @@ def test_the_host_part_gives_the_host_files_bytes(name: str, tmp_path: Path) -> 
     assert tuple(side.dim_value for side in dims[1:]) == planes.shape[1:]
 
 
-@pytest.mark.parametrize("shape", [(1, 3, 203), (1, 203, 95), (96, 96)])
-def test_the_host_part_refuses_what_it_cannot_restore(
-    shape: tuple[int, ...], tmp_path: Path
-) -> None:
-    """An image of a wrong shape or too small for a tile is refused in one sentence.
-
-    No file is written, so that a partial result is never taken for a restored image.
-    """
-    folder = bd.Board.load("vck190").kit(network(NAME), tmp_path / "kit", tile=TILE_PX)
-    np.save(tmp_path / "image.npy", np.full(shape, 0.1, np.float32))
-    command = [sys.executable, "host.py", str(tmp_path / "image.npy"), str(tmp_path / "out.npy")]
-    result = subprocess.run(command, cwd=folder, check=False, capture_output=True, text=True)
-    assert result.returncode == 1
-    assert result.stderr.splitlines()[-1].endswith(f"at least 96 x 96 pixels, got shape {shape}.")
-    assert not (tmp_path / "out.npy").exists()
-
-
 OFFSET_DN = 60
 NAME = "convbeers-xs-int8"
 TILE_PX = 96
@@ -152,6 +135,22 @@ def by_host(folder: Path, image: np.ndarray) -> np.ndarray:
         [sys.executable, "-c", BARE, "-", "image.npy", "out.npy"], cwd=folder, check=True
     )
     return np.asarray(np.load(folder / "out.npy")[0])
+
+
+@pytest.mark.parametrize("shape", [(1, 203, 95), (96, 96)])
+def test_the_host_part_refuses_what_it_cannot_restore(
+    shape: tuple[int, ...], kit: Path, tmp_path: Path
+) -> None:
+    """An image of a wrong shape or too small for a tile is refused in one sentence.
+
+    No file is written, so that a partial result is never taken for a restored image.
+    """
+    np.save(tmp_path / "image.npy", np.full(shape, 0.1, np.float32))
+    command = [sys.executable, "host.py", str(tmp_path / "image.npy"), str(tmp_path / "out.npy")]
+    result = subprocess.run(command, cwd=kit, check=False, capture_output=True, text=True)
+    assert result.returncode == 1
+    assert result.stderr.splitlines()[-1].endswith(f"at least 96 x 96 pixels, got shape {shape}.")
+    assert not (tmp_path / "out.npy").exists()
 
 
 def facts(folder: Path) -> dict[str, Any]:
