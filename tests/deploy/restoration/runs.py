@@ -15,6 +15,8 @@ import rasterio
 import tifffile
 
 import beers_deploy as bd
+from beers_deploy.model.raster.facts import Raster
+from beers_deploy.model.raster.source import ArraySource
 from beers_deploy.profiles.figures import Row
 from beers_deploy.restoration.tiles.engine import Restorer, Tile
 from beers_deploy.verbs.restore import restore
@@ -42,6 +44,26 @@ def restored(
         pixels = file.read()
     return pixels if len(pixels) > 1 else pixels[0], row
 
+
+def source_of(pixels: np.ndarray, nodata: float | None = None) -> ArraySource:
+    """Return pixels (H, W) or (bands, H, W) as an image."""
+    planes = pixels if pixels.ndim == 3 else pixels[None]
+    bands, height_px, width_px = planes.shape
+    return ArraySource(planes, Raster(bands, height_px, width_px, planes.dtype, nodata))
+
+
+def names(folder: Path) -> list[str]:
+    """Return the sorted names of all that a folder contains."""
+    return sorted(path.name for path in folder.iterdir())
+
+
+def marked(nodata: float) -> dict[str, Any]:
+    """Return tags of a TIFF in which this value marks missing pixels, as tifffile takes them."""
+    return {"extratags": [(42113, "s", 0, f"{nodata}", True)]}
+
+
+PLANES: dict[str, Any] = {"planarconfig": "separate", "photometric": "minisblack"}
+"""Layout of a TIFF of several bands, as tifffile takes it."""
 
 NAME = "pleiades-degraded"
 TRANSFORM = rasterio.Affine(0.5, 0.1, 500000, 0.05, -0.5, 4600000)

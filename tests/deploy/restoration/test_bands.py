@@ -5,55 +5,42 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-import tifffile
 from numpy.testing import assert_array_equal
 
-from beers_deploy.model.raster.reader import open_raster
+from beers_deploy.model.raster.facts import Raster
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.restoration.bands import sensors_of
+from beers_deploy.restoration.bands import in_order, sensors_of
+from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import done, refused
+from tests.deploy.restoration.runs import names
 from tests.model.raster import formats as images
 
 FIRST = "pleiades-degraded"
 SECOND = "blind"
 
 
-def restored(image: Path, sensor: str, *more: str) -> tuple[np.ndarray, str]:
-    out = image.with_name("out.tif")
-    network = f"--network convbeers-xs --sensor {sensor}"
-    output = done(f"restore {image} {out} --overwrite {network}", *more)
-    return tifffile.imread(out), output
-
-
 def test_each_named_band_has_its_own_network_whatever_the_order_of_the_option(
     tmp_path: Path,
 ) -> None:
-    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    result, _ = restored(image, f"B1={FIRST},B0={SECOND}", "--tile", "64", "--cog")
-    with rasterio.open(tmp_path / "out.tif") as file:
+    pixels = images.digital_numbers()
+    image = images.write_tiff(tmp_path / "in.tif", pixels)
+    out = tmp_path / "out.tif"
+    done(f"restore {image} {out} --network convbeers-xs --sensor B1={FIRST},B0={SECOND} --cog")
+    with rasterio.open(out) as file:
         assert file.tags()["RESTORED_SENSOR"] == f"{SECOND}, {FIRST}"
         digests = file.tags()["RESTORED_NETWORK_SHA256"].split(", ")
         result = file.read()
     assert len(set(digests)) == 2
     for band, sensor in enumerate((SECOND, FIRST)):
-        assert_array_equal(result[band], restored(image, sensor)[0][band])
+        alone = restore(pixels[band], network="convbeers-xs", sensor=sensor)
+        assert_array_equal(result[band], alone)
 
 
-def test_bands_without_names_are_used_in_order(tmp_path: Path) -> None:
-    tifffile.imwrite(
-        tmp_path / "in.tif",
-        images.digital_numbers(),
-        planarconfig="separate",
-        photometric="minisblack",
-    )
-    with open_raster(tmp_path / "in.tif") as source:
-        assert source.raster.bands == 2
-        assert source.raster.band_names == ()
-    result, _ = restored(tmp_path / "in.tif", f"red={SECOND},blue={FIRST}")
-    for band, sensor in ((0, SECOND), (1, FIRST)):
-        assert_array_equal(result[band], restored(tmp_path / "in.tif", sensor)[0][band])
-    assert_array_equal(restored(tmp_path / "in.tif", f"B1={FIRST},B0={SECOND}")[0], result)
+def test_bands_without_names_are_used_by_their_number_or_in_order() -> None:
+    unnamed = Raster(2, 9, 9, np.dtype(np.uint16))
+    assert in_order({"red": "first", "blue": "second"}, unnamed) == ["first", "second"]
+    assert in_order({"B1": "second", "B0": "first"}, unnamed) == ["first", "second"]
     by_name = sensors_of({"B1": FIRST, "B0": Sensor.load(SECOND)})
     assert by_name == sensors_of(f"B1={FIRST},B0={SECOND}")
 
@@ -71,7 +58,7 @@ def test_what_does_not_fit_is_refused(sensor: str, words: str, tmp_path: Path) -
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
     network = f"--network convbeers-xs --sensor {sensor}"
     assert words in refused(f"restore {image} {tmp_path}/out.tif {network}")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]
+    assert names(tmp_path) == ["in.tif"]
 
 
 def test_one_profile_is_for_all_bands(tmp_path: Path) -> None:

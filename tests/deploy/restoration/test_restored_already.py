@@ -16,8 +16,6 @@ from scipy.ndimage import gaussian_filter
 
 import beers_deploy as bd
 from beers_deploy.model.family import SNR_BRIGHT, SensorFamily
-from beers_deploy.model.raster.facts import Raster
-from beers_deploy.model.raster.source import ArraySource
 from beers_deploy.model.shipped import INT8
 from beers_deploy.model.simulator.acquire import acquire_three, prepare_scene
 from beers_deploy.model.simulator.detector import Draw, to_uint16
@@ -26,6 +24,7 @@ from beers_deploy.network import Network
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.sensor_check.raw import restored_already
 from tests.deploy.command_line import done
+from tests.deploy.restoration.runs import source_of
 
 NETWORK = f"convbeers-xs{INT8}"
 SENSOR = Sensor.load("pleiades-degraded")
@@ -50,10 +49,7 @@ def raw(seed: int = 0, light: float = 1.0, snr: tuple[float, float] = SNR_BRIGHT
 def look(
     image: np.ndarray, full_scale: float = 4095, network: str = NETWORK, nodata: float | None = None
 ) -> str:
-    planes = image if image.ndim == 3 else image[None]
-    bands, height, width = planes.shape
-    source = ArraySource(planes, Raster(bands, height, width, planes.dtype, nodata))
-    return restored_already(source, [Network.load(network).model], full_scale)
+    return restored_already(source_of(image, nodata), [Network.load(network).model], full_scale)
 
 
 @settings(max_examples=10)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import rasterio
 from numpy.testing import assert_array_equal
-from rasterio.control import GroundControlPoint
 
 import beers_deploy as bd
 from beers_deploy.model.self_check import BLOCK_PX, MOST_CHI2
@@ -17,7 +16,7 @@ from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.verbs.restore import restore
-from tests.deploy.restoration.runs import NAME, TRANSFORM, two_bands
+from tests.deploy.restoration.runs import NAME, TRANSFORM, names, two_bands
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +91,7 @@ def test_a_network_for_another_sensor_is_found(
     strict = tmp_path / "strict.tif"
     with pytest.raises(ImageError, match=r"of .* fails the self-check: .* contradict the raw"):
         run(image, strict, network=other_network, strict=True, self_check=tmp_path / "map.tif")
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["out.tif"]
+    assert names(tmp_path) == ["out.tif"]
 
 
 def test_the_traditional_pipeline_is_checked_too(image: Path, tmp_path: Path) -> None:
@@ -116,29 +115,3 @@ def test_without_a_known_sensor_there_is_no_check(image: Path, tmp_path: Path) -
     assert not (tmp_path / "2.tif").exists()
     with pytest.raises(OptionError, match="self_check"):
         restore(np.ones((80, 80), np.uint16), sensor=NAME, self_check=tmp_path / "map.tif")
-
-
-def test_ground_control_points_move_to_the_blocks(image: Path, tmp_path: Path) -> None:
-    """Ground control points of the image are those of the map, in its blocks instead of pixels."""
-    with rasterio.open(image) as file:
-        pixels = file.read(1)
-    height, width = pixels.shape
-    points = [
-        GroundControlPoint(row, column, x=column / 2, y=-row / 2, z=3.0)
-        for row, column in ((0, 0), (0, width), (height, 0))
-    ]
-    with rasterio.open(
-        tmp_path / "raw.tif", "w", driver="GTiff", width=width, height=height, count=1,
-        dtype="uint16", gcps=points, crs="EPSG:32631",
-    ) as file:  # fmt: skip
-        file.write(pixels, 1)
-    run(
-        tmp_path / "raw.tif", tmp_path / "out.tif", network="convbeers-xs",
-        self_check=tmp_path / "map.tif",
-    )  # fmt: skip
-    with rasterio.open(tmp_path / "map.tif") as file:
-        moved, crs = file.gcps
-    assert crs == "EPSG:32631"
-    assert [(p.row * BLOCK_PX, p.col * BLOCK_PX, p.x, p.y, p.z) for p in moved] == [
-        (p.row, p.col, p.x, p.y, p.z) for p in points
-    ]

@@ -15,6 +15,7 @@ import pytest
 import rasterio
 
 from tests.deploy.command_line import done, refused
+from tests.deploy.restoration.runs import names
 from tests.model.raster import formats as images
 
 pystac: Any = pytest.importorskip("pystac")
@@ -49,17 +50,17 @@ def require_valid(content: dict[str, Any]) -> None:
         jsonschema.validate(fields, PROCESSING)
 
 
-def restored_item(image: Path, item: Path, model: Path) -> dict[str, Any]:
-    out = image.with_name("out.tif")
-    done(f"restore {image} {out} --network {model} --cog --stac {item}")
+def restored_item(image: Path, item: Path, options: str) -> dict[str, Any]:
+    """Restore an image into out.tif next to it, and return its item, which is valid."""
+    done(f"restore {image} {image.with_name('out.tif')} {options} --cog --stac {item}")
     content: dict[str, Any] = json.loads(item.read_text())
+    require_valid(content)
     return content
 
 
 def test_an_item_is_valid_and_has_the_place_of_the_image(model: Path, tmp_path: Path) -> None:
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    content = restored_item(image, tmp_path / "catalogue" / "item.json", model)
-    require_valid(content)
+    content = restored_item(image, tmp_path / "catalogue" / "item.json", f"--network {model}")
     assert content["assets"]["restored"]["href"] == "../out.tif"
     assert "cloud-optimized" in content["assets"]["restored"]["type"]
     assert [band["name"] for band in content["assets"]["restored"]["bands"]] == ["B0", "B1"]
@@ -75,33 +76,26 @@ def test_an_image_without_a_place_has_no_geometry(model: Path, tmp_path: Path) -
     image = images.write_tiff(
         tmp_path / "in.tif", images.digital_numbers(), crs=None, transform=None
     )
-    content = restored_item(image, tmp_path / "item.json", model)
-    require_valid(content)
+    content = restored_item(image, tmp_path / "item.json", f"--network {model}")
     assert content["geometry"] is None
     assert "bbox" not in content
 
 
-def test_an_item_needs_a_cog_and_its_package(
+def test_an_item_needs_its_package(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    command = f"restore {image} {tmp_path}/out.tif --stac {tmp_path}/i.json --network {model}"
+    command = f"restore {image} {tmp_path}/out.tif --network {model} --cog --stac"
     monkeypatch.setitem(sys.modules, "pystac", None)
-    assert "--stac has no effect without --cog" in refused(command)
-    assert "beers-deploy[stac]" in refused(f"{command} --cog")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]
+    assert "beers-deploy[stac]" in refused(command, tmp_path / "i.json")
+    assert names(tmp_path) == ["in.tif"]
 
 
 def test_an_item_tells_how_the_image_was_made(tmp_path: Path) -> None:
     """A shipped network is made for the sensor, so it is written: its digest is that of the run."""
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    words = "--network convbeers-xs-int8 --sensor pleiades-degraded --cog"
-    done(
-        f"restore {image} {tmp_path}/out.tif {words} --stac {tmp_path}/out.json "
-        f"--self-check {tmp_path}/blocks.tif"
-    )
-    content = json.loads((tmp_path / "out.json").read_text())
-    require_valid(content)
+    options = "--network convbeers-xs-int8 --sensor pleiades-degraded --self-check"
+    content = restored_item(image, tmp_path / "out.json", f"{options} {tmp_path}/blocks.tif")
     about = content["properties"]
     assert about["processing:datetime"] == about["datetime"]
     assert set(about["processing:software"]) == {"beers-deploy", "onnxruntime"}
@@ -148,22 +142,18 @@ def test_a_network_with_a_file_is_referred_to_where_it_lies(model: Path, tmp_pat
     own.parent.mkdir()
     own.write_bytes(model.read_bytes())
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    content = restored_item(image, tmp_path / "items" / "a.json", own)
-    require_valid(content)
+    restored_item(image, tmp_path / "items" / "a.json", f"--network {own}")
     network = network_item(tmp_path / "items" / "a-network.json")
     assert network.assets["model"].href == "../networks/1.onnx"
     assert mlm.MLMExtension.ext(network).mlm_name == "network"
-    names = sorted(path.name for path in (tmp_path / "items").iterdir())
-    assert names == ["a-network.json", "a.json"]
+    assert names(tmp_path / "items") == ["a-network.json", "a.json"]
 
 
 def test_each_sensor_has_a_network_and_the_traditional_pipeline_has_none(tmp_path: Path) -> None:
     pixels = images.digital_numbers()
     image = images.write_tiff(tmp_path / "in.tif", pixels)
     sensors = "--network convbeers-xs --sensor B0=pleiades-degraded,B1=blind"
-    done(f"restore {image} {tmp_path}/a.tif {sensors} --cog --stac {tmp_path}/a.json")
-    content = json.loads((tmp_path / "a.json").read_text())
-    require_valid(content)
+    content = restored_item(image, tmp_path / "a.json", sensors)
     names = ["a-network-1.json", "a-network-2.json"]
     assert content["assets"]["restored"]["processing:expression"]["expression"] == names
     items = [network_item(tmp_path / name) for name in names]
@@ -171,9 +161,7 @@ def test_each_sensor_has_a_network_and_the_traditional_pipeline_has_none(tmp_pat
     assert told == ["pleiades-degraded", "blind"]
 
     small = images.write_tiff(tmp_path / "small.tif", np.ascontiguousarray(pixels[:, :24, :24]))
-    how = "--method traditional --quality fast --sensor pleiades-degraded"
-    done(f"restore {small} {tmp_path}/b.tif {how} --cog --stac {tmp_path}/b.json")
-    content = json.loads((tmp_path / "b.json").read_text())
-    require_valid(content)
+    how = "--method traditional --quality fast --sensor pleiades-degraded --overwrite"
+    content = restored_item(small, tmp_path / "b.json", how)
     assert content["links"] == []
     assert "processing:level" not in content["assets"]["restored"]

@@ -24,7 +24,7 @@ from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.restoration.tiles.rows import HeldRows
 from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import done
-from tests.deploy.restoration.runs import restored, stopped_after
+from tests.deploy.restoration.runs import PLANES, marked, restored, stopped_after
 from tests.quant.tiling.small_networks import espcn, four_bands
 
 FLOAT = "convbeers-xs"
@@ -80,17 +80,18 @@ def by_file(
     folder: Path, pixels: np.ndarray, layout: dict[str, Any] | None = None, **options: Any
 ) -> np.ndarray:
     """Restore a file, `layout` of which is what tifffile takes."""
-    tags = dict(layout or {})
-    if pixels.dtype == np.uint16:
-        tags["extratags"] = [(42113, "s", 0, f"{NODATA}", True)]
+    tags = (layout or {}) | (marked(NODATA) if pixels.dtype == np.uint16 else {})
     return restored(folder, pixels, tags, **{**DEFAULTS, **options})[0]
 
 
-@pytest.mark.parametrize(("name", "floats"), [(FLOAT, True), (INT8, False)])
+@pytest.mark.parametrize(("name", "floats"), [(FLOAT, True), (INT8, False), ("", True)])
 def test_tiles_and_files_give_the_whole_image_s_pixels(
-    name: str, floats: bool, tmp_path: Path
+    name: str, floats: bool, model: Path, tmp_path: Path
 ) -> None:
-    """The pixels are the same bit for bit, with both steps, missing and saturated pixels."""
+    """The pixels are the same bit for bit, with both steps, missing and saturated pixels; for the
+    network of a user without exposures.
+    """
+    name = name or str(model)
     pixels = as_floats(lacking()) if floats else lacking()
     nodata = None if floats else NODATA
     untiled = by_array(pixels, name, nodata=nodata)
@@ -124,9 +125,8 @@ def test_each_band_takes_the_steps_of_its_own_sensor(
 ) -> None:
     """The sensor of one band has other factors, or is not known."""
     bands = np.stack([image(), image()[::-1]])
-    separate: dict[str, Any] = {"planarconfig": "separate", "photometric": "minisblack"}
     by_name = {f"B{number}": sensor for number, sensor in enumerate(sensors)}
-    results = by_file(tmp_path, bands, separate, network=INT8, sensor=by_name, tile=64)
+    results = by_file(tmp_path, bands, PLANES, network=INT8, sensor=by_name, tile=64)
     for band, sensor, result in zip(bands, sensors, results, strict=True):
         assert_array_equal(result, by_array(band, INT8, sensor=sensor, nodata=NODATA))
     da = pytest.importorskip("dask.array", reason="the extra 'dask' is not installed")
@@ -159,20 +159,34 @@ def test_a_run_that_was_stopped_twice_is_resumed_to_the_same_bytes(tmp_path: Pat
     assert out.read_bytes() == expected
 
 
-@pytest.mark.parametrize("switch", [{"consistency": False}, {"exposure": False}])
-def test_a_run_is_not_resumed_with_other_steps(switch: dict[str, Any], tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "in.tif", np.concatenate([image(), image()]))
+OTHER: list[dict[str, Any]] = [
+    {"consistency": False},
+    {"exposure": False},
+    {"halo": 20},
+    {"tile": 64},
+    {"full_scale": 4000},
+    {"sensor": NOISY},
+    {"network": FLOAT},
+    {"fix_detectors": "found"},
+]
+"""Options of which each makes other pixels."""
+
+
+def test_a_run_is_not_resumed_with_other_options(tmp_path: Path) -> None:
+    pixels = np.concatenate([image(), image()])
+    pixels[9, 9] = 4095
+    tifffile.imwrite(tmp_path / "in.tif", pixels)
     stop(tmp_path, tiles=25)
-    with pytest.raises(OptionError, match="resume"):
-        restore(tmp_path / "in.tif", tmp_path / "out.tif", **HOW, **switch, resume=True)
+    for other in OTHER:
+        with pytest.raises(OptionError, match=r"`resume` needs .* the options"):
+            restore(tmp_path / "in.tif", tmp_path / "out.tif", **HOW | other, resume=True)
 
 
 CONSISTENCY = "consistency step"
 BRIGHTENED = "brightened pixels"
 
 
-@pytest.mark.parametrize("exposure", [True, False])
-@pytest.mark.parametrize("consistency", [True, False])
+@pytest.mark.parametrize(("consistency", "exposure"), [(True, False), (False, True)])
 def test_the_command_reports_which_steps_were_taken(
     consistency: bool, exposure: bool, tmp_path: Path
 ) -> None:
@@ -247,34 +261,19 @@ def test_where_the_consistency_step_cannot_be_taken_it_is_off(
     make: Callable[[], onnx.ModelProto] | None, options: dict[str, Any], reason: str, tmp_path: Path
 ) -> None:
     pixels = image()
-    layout = {"photometric": "minisblack"}
+    layout = None
     how: dict[str, Any] = {**DEFAULTS, "network": INT8, **options}
     if make:
         how["network"] = tmp_path / "network.onnx"
         save_onnx(make(), how["network"])
     if isinstance(make, partial):
         pixels = np.stack([pixels] * 4)
-        layout["planarconfig"] = "separate"
+        layout = PLANES
     result, row = restored(tmp_path, pixels, layout, **how)
     assert row.text["consistency"] == f"off: {reason}"
     assert CONSISTENCY not in row.figures
     without, _ = restored(tmp_path, pixels, layout, **how, consistency=False)
     assert_array_equal(result, without)
-
-
-def test_a_network_of_the_user_s_gets_the_consistency_step_and_no_exposure(
-    model: Path, tmp_path: Path
-) -> None:
-    pixels = lacking().astype(np.float32)
-    own: dict[str, Any] = {**DEFAULTS, "network": model}
-    tiled, row = restored(tmp_path, pixels, **own, tile=23)
-    assert row.text["consistency"] == "on"
-    assert "exposures" not in row.text
-    untiled, _ = restored(tmp_path, pixels, **own, tile=512)
-    assert_array_equal(tiled, untiled)
-    without, row = restored(tmp_path, pixels, **own, tile=23, consistency=False)
-    assert row.text["consistency"] == "off"
-    assert (tiled != without).mean() > 0.8
 
 
 def test_the_mean_of_a_dark_image_is_kept() -> None:

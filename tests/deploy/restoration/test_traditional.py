@@ -1,12 +1,10 @@
 """The traditional pipeline gives of a file the pixels of the chain on the whole array."""
 
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import rasterio
 import tifffile
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
@@ -16,6 +14,7 @@ from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import done, refused
+from tests.deploy.restoration.runs import PLANES, marked, names, restored
 from tests.profiles.own_sensor import own_sensor
 
 SHAPE = (151, 67)
@@ -34,24 +33,14 @@ def of_array(pixels: np.ndarray, sensor: Sensor = SENSOR) -> np.ndarray:
 
 
 def of_file(
-    folder: Path, pixels: np.ndarray, options: dict[str, Any] | None = None, **tags: Any
+    folder: Path, pixels: np.ndarray, tags: dict[str, Any] | None = None, **options: Any
 ) -> np.ndarray:
-    """Restore pixels by way of files.
-
-    Args:
-        folder: of the files.
-        pixels: of the image.
-        options: of `restore`, besides the method, and the sensor of the tests.
-        tags: of the image's file.
-    """
-    tifffile.imwrite(folder / "in.tif", pixels, **tags)
-    chosen = {"method": "traditional", "sensor": SENSOR, "overwrite": True, **(options or {})}
-    (row,) = restore(folder / "in.tif", folder / "out.tif", **chosen)
+    """Restore pixels by way of files, for the sensor of the tests if `options` name no other."""
+    chosen = {"method": "traditional", "sensor": SENSOR, **options}
+    result, row = restored(folder, pixels, tags, **chosen)
     assert row.text["method"] == "traditional"
-    assert sorted(path.name for path in folder.iterdir()) == ["in.tif", "out.tif"]
-    with warnings.catch_warnings(action="ignore"), rasterio.open(folder / "out.tif") as file:
-        restored: np.ndarray = file.read()
-    return restored if len(restored) > 1 else restored[0]
+    assert names(folder) == ["in.tif", "out.tif"]
+    return result
 
 
 def other_sensor(folder: Path) -> Path:
@@ -63,13 +52,10 @@ def other_sensor(folder: Path) -> Path:
 
 def test_a_file_gives_the_pixels_of_the_array(tmp_path: Path) -> None:
     expected = of_array(noise())
-    tags = [(33550, "d", 3, (0.5, 0.5, 0.0), True)]
-    restored = of_file(tmp_path, noise(), rowsperstrip=16, compression="zlib", extratags=tags)
-    assert_array_equal(restored, np.rint(expected).astype(np.uint16))
-    with tifffile.TiffFile(tmp_path / "out.tif") as file:
-        assert file.pages.first.tags[33550].value == (0.5, 0.5, 0.0)
+    result = of_file(tmp_path, noise(), {"rowsperstrip": 16, "compression": "zlib"})
+    assert_array_equal(result, np.rint(expected).astype(np.uint16))
     by_array = restore(noise(), method="traditional", sensor=SENSOR)
-    assert_array_equal(by_array, restored)
+    assert_array_equal(by_array, result)
     floats = of_file(tmp_path, noise().astype(np.float32))
     assert_array_equal(floats, expected)
     # The pipeline changes the image by more than rounding.
@@ -79,8 +65,7 @@ def test_a_file_gives_the_pixels_of_the_array(tmp_path: Path) -> None:
 def test_missing_pixels_stay(tmp_path: Path) -> None:
     pixels = noise()
     pixels[20:40, 5:9] = 7
-    restored = of_file(tmp_path, pixels, extratags=[(42113, "s", 0, "7", True)])
-    assert_array_equal(restored == 7, pixels == 7)
+    assert_array_equal(of_file(tmp_path, pixels, marked(7)) == 7, pixels == 7)
     with_nan = np.where(pixels == 7, np.nan, pixels).astype(np.float32)
     assert_array_equal(of_file(tmp_path, with_nan), of_array(with_nan))
 
@@ -88,36 +73,27 @@ def test_missing_pixels_stay(tmp_path: Path) -> None:
 def test_bands_are_restored_one_by_one_each_for_its_sensor(tmp_path: Path) -> None:
     bands = np.stack([noise(0), noise(1)])
     for sensors in ({"": SENSOR}, {"B1": SENSOR, "B2": Sensor.load("dior-medium")}):
-        (tmp_path / "files").mkdir(exist_ok=True)
-        restored = of_file(
-            tmp_path / "files",
-            bands,
-            {"sensor": sensors},
-            planarconfig="separate",
-            photometric="minisblack",
-        )
+        results = of_file(tmp_path, bands, PLANES, sensor=sensors)
         for band, pixels in enumerate(bands):
             sensor = list(sensors.values())[band % len(sensors)]
             expected = of_array(pixels, sensor)
-            assert_array_equal(restored[band], np.rint(expected).astype(np.uint16))
+            assert_array_equal(results[band], np.rint(expected).astype(np.uint16))
 
 
 def test_the_output_has_the_scale_of_the_input_whatever_the_gain(tmp_path: Path) -> None:
-    mine = {"sensor": other_sensor(tmp_path)}
     (tmp_path / "files").mkdir()
     flat = np.full(SHAPE, 8000, np.uint16)
-    restored = of_file(tmp_path / "files", flat, mine)
-    assert abs(float(restored.mean()) / 8000 - 1) < 0.01
+    result = of_file(tmp_path / "files", flat, sensor=other_sensor(tmp_path))
+    assert abs(float(result.mean()) / 8000 - 1) < 0.01
     shares = (noise() / 4095).astype(np.float32)
-    restored = of_file(tmp_path / "files", shares, {"full_scale": 1.0})
-    assert_allclose(restored * 4095, of_array(noise()), atol=0.5)
+    result = of_file(tmp_path / "files", shares, full_scale=1.0)
+    assert_allclose(result * 4095, of_array(noise()), atol=0.5)
 
 
 @pytest.mark.parametrize(
     ("pixels", "words"),
     [
         (np.full(SHAPE, 5000, np.uint16), "above full scale"),
-        (np.full(SHAPE, 200, np.uint8), "full_scale"),
         (np.full(SHAPE, 0.5, np.float32), "full_scale"),
         (np.full(SHAPE, np.nan, np.float32), "only NaN or nodata"),
     ],
@@ -129,7 +105,7 @@ def test_what_it_cannot_restore_leaves_the_old_output(
     with pytest.raises(ImageError, match=words):
         of_file(tmp_path, pixels)
     assert (tmp_path / "out.tif").read_bytes() == b"the old one"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif", "out.tif"]
+    assert names(tmp_path) == ["in.tif", "out.tif"]
 
 
 def test_the_command_needs_a_sensor(tmp_path: Path) -> None:
