@@ -10,7 +10,7 @@ import io
 import math
 import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain
@@ -165,13 +165,12 @@ SVG = "http://www.w3.org/2000/svg"
 XLINK = "http://www.w3.org/1999/xlink"
 
 
-def svg_of(figure: "Figure", name: str, titles: Mapping[str, str] | None = None) -> Markup:
+def svg_of(figure: "Figure", name: str) -> Markup:
     """Convert a matplotlib figure to SVG text that follows the reader's light or dark mode.
 
     Args:
         figure: the figure, drawn within `look` in colours of LIGHT.
         name: the label of the picture for screen readers.
-        titles: the tooltips of lines and points by group id, which `Artist.set_gid` sets.
     """
     stream = io.BytesIO()
     with look():
@@ -195,21 +194,11 @@ def svg_of(figure: "Figure", name: str, titles: Mapping[str, str] | None = None)
     style.text = plot_style()
     root.insert(0, style)
     for group in root.iter(f"{{{SVG}}}g"):
-        _name(group, titles or {})
+        # A group id that `Artist.set_gid` set becomes a class. Those of matplotlib contain "_".
+        kind = group.attrib.pop("id", "_")
+        if "_" not in kind:
+            group.set("class", kind)
     return Markup(ET.tostring(root, encoding="unicode"))  # noqa: S704 - ElementTree escapes
-
-
-def _name(group: ET.Element, titles: Mapping[str, str]) -> None:
-    """Replace a group id of ours by a class, and add its title. The ids of matplotlib contain "_"
-    and are dropped.
-    """
-    kind = group.attrib.pop("id", "_")
-    if "_" not in kind:
-        group.set("class", "dot" if kind in titles else kind)
-    if kind in titles:
-        words = ET.Element(f"{{{SVG}}}title")
-        words.text = visible(titles[kind])
-        group.insert(0, words)
 
 
 def plot_style() -> str:
