@@ -29,8 +29,8 @@ Facts = dict[str, object]
 def host_facts(
     network: Network,
     tile_px: int,
-    sensor: Sensor | None = None,
-    exposed: Mapping[float, Network] | None = None,
+    sensor: Sensor | None,
+    exposed: Mapping[float, Network],
 ) -> Facts | None:
     """Compute the content of host.json, from which a kit's `host.py` runs the host part.
 
@@ -42,7 +42,7 @@ def host_facts(
         tile_px: side of a tile in pixels.
         sensor: the sensor that acquires the images; None omits the steps around the network.
         exposed: the networks for dark pixels and strong edges, by the exposure factor by which
-            pixels are multiplied before the network; None for none.
+            pixels are multiplied before the network; empty for none.
 
     Returns:
         The constants by name, as JSON can hold them; None if `host.py` cannot compute the host part
@@ -52,9 +52,8 @@ def host_facts(
         OptionError: the sensor would change nothing.
     """
     facts = host_constants(network, tile_px)
-    others = exposed or {}
     step = consistency_facts(network, sensor) if sensor is not None and facts is not None else None
-    if sensor is not None and step is None and not others:
+    if sensor is not None and step is None and not exposed:
         raise OptionError(
             f"`sensor` {sensor.name} has no effect on {network.label}, because neither the "
             "consistency step nor exposures can be used. Leave it out, or name a shipped network "
@@ -67,7 +66,8 @@ def host_facts(
         **facts,
         # For another exposure only the unit differs, since the network is the same.
         "exposures": {
-            f"{factor:g}": read_core(other.model).host_part.unit for factor, other in others.items()
+            f"{factor:g}": read_core(other.model).host_part.unit
+            for factor, other in exposed.items()
         },
         # These decide which factor a pixel gets; all but `edge_px` are shares of full scale.
         "headroom": HEADROOM,

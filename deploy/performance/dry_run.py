@@ -105,7 +105,7 @@ def header_scale(name: str, raster: Raster, reading: Reading) -> FullScale | str
             "state the full scale"
         )
     try:
-        return full_scale_of(name, raster, (), reading.full_scale, reading.sensor_bits)
+        return full_scale_of(name, raster, (), reading)
     except ImageError:
         # Of integers only those of 8 bits leave it open.
         return "8-bit pixels do not tell it; state the pixel value that is full scale"

@@ -234,7 +234,7 @@ class NetworkPipeline:
         logger.info(plan.sentence)
         check_memory(rows_bytes(source, plan), reading.memory_bytes)
         extents = (raster.extent(source.read(row.keep_start, row.keep_stop)) for row in plan.rows)
-        scale = full_scale_of(name, raster, extents, reading.full_scale, reading.sensor_bits)
+        scale = full_scale_of(name, raster, extents, reading)
         if scale.assumed:
             logger.info("full scale: %s; give `full_scale` if it is another", scale.words)
         check, check_s = check_sensor(source, networks, reading, scale.value, name)

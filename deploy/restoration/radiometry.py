@@ -81,8 +81,7 @@ def full_scale_of(
     name: str,
     raster: Raster,
     extents: Iterable[Extent],
-    requested: float | None = None,
-    bits: int | None = None,
+    reading: Reading,
 ) -> FullScale:
     """Determine the full scale of an image: that of the user, the file, the sensor, or 12 bits.
 
@@ -91,14 +90,15 @@ def full_scale_of(
         raster: the description of the image.
         extents: for each part of the image its largest value, and whether its values are integers.
             They are read for float pixels only, to tell digital numbers from other units.
-        requested: the full scale that the user gives, or None.
-        bits: the number of bits per pixel of the sensor, if the user names its profile, or None.
+        reading: the options of the run, of which `full_scale` and the bits of `sensors` count.
 
     Raises:
         OptionError: the user's full scale is not positive, or the output's type cannot hold it.
         ImageError: the pixels have 8 bits, or are floats that may be other units than digital
             numbers, and neither the user nor the file states a full scale.
     """
+    requested = reading.full_scale
+    bits = reading.sensor_bits
     if requested is not None:
         settled_scale(name, raster.dtype, extents, requested)
         kind = raster.out_dtype

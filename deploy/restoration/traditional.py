@@ -195,7 +195,7 @@ class TraditionalMethod:
         check_memory(needed, reading.memory_bytes)
         rows = strips(raster.height_px, STRIP_PX)
         extents = (raster.extent(source.read(*strip)) for strip in rows)
-        scale = full_scale_of(name, raster, extents, reading.full_scale, reading.sensor_bits)
+        scale = full_scale_of(name, raster, extents, reading)
         check, check_s = check_sensor(source, (), reading, scale.value, name)
         pipelines = tuple(
             TraditionalPipeline(sensor.nominal(), sensor.reference.nominal(), self.quality)

@@ -44,7 +44,7 @@ def restore_lazily(bands: Any, raster: Raster, pipeline: NetworkPipeline, readin
     plan = plan_for(networks[0], raster.shape, pipeline.tiles)
     # The type alone decides the scale at once. Pixels may lead to a refusal later, but not to
     # another scale.
-    full_scale = full_scale_of(NAME, raster, (), reading.full_scale, reading.sensor_bits).value
+    full_scale = full_scale_of(NAME, raster, (), reading).value
     around = pipeline.around
     packed = pipeline.engine.packed
     exposed = exposed_networks(networks, around, plan.tiling, full_scale, packed)
@@ -141,5 +141,5 @@ def _strip(reading: Reading, restorer: Restorer, window: np.ndarray, top: int, l
     raster = restorer.raster
     # A dark tile may look like radiances; one tile alone does not prove that the image is.
     extent = raster.extent(window)._replace(whole=True)
-    full_scale_of(NAME, raster, [extent], reading.full_scale, reading.sensor_bits)
+    full_scale_of(NAME, raster, [extent], reading)
     return checked_strip(raster, top, window, restorer.full_scale, NAME, left=left)

@@ -267,7 +267,7 @@ def test_a_sensor_that_does_not_exist_or_changes_nothing_is_one_sentence(tmp_pat
     # ESPCN enlarges the image.
     enlarging = network("espcn")
     with pytest.raises(OptionError, match="`sensor` pleiades-degraded has no effect"):
-        host_facts(enlarging, TILE_PX, bd.Sensor.load("pleiades-degraded"))
+        host_facts(enlarging, TILE_PX, bd.Sensor.load("pleiades-degraded"), {})
     assert not (tmp_path / "kit").exists()
 
 

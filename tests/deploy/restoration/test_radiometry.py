@@ -18,7 +18,7 @@ from beers_deploy.model.raster.reader import open_raster
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.restoration.radiometry import FullScale, full_scale_of
+from beers_deploy.restoration.radiometry import FullScale, Reading, full_scale_of
 from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import marked, restored
 from tests.model.raster import formats as images
@@ -44,8 +44,12 @@ def run(model: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> Run:
     return run
 
 
-def scale(raster: Raster, option: float | None = None, bits: int | None = None) -> FullScale:
-    return full_scale_of("x", raster, (), option, bits)
+def scale(
+    raster: Raster, option: float | None = None, bits: int | None = None, largest: float = 0
+) -> FullScale:
+    sensors = {"": Sensor.load("pleiades-degraded").replace(bits=bits)} if bits else {}
+    extents = [Extent(largest, whole=False)]
+    return full_scale_of("x", raster, extents, Reading(sensors, full_scale=option))
 
 
 def test_the_user_overrides_the_file_and_the_file_overrides_the_sensor() -> None:
@@ -136,6 +140,6 @@ def test_values_above_a_stated_full_scale_are_clipped_counted_and_reported(run: 
 
 def test_floats_of_digital_numbers_have_the_sensor_s_full_scale_and_shares_none() -> None:
     floats = Raster(1, 9, 9, np.dtype(np.float32))
-    assert full_scale_of("x", floats, [Extent(900.0, whole=False)], bits=10).value == 1023
+    assert scale(floats, bits=10, largest=900.0).value == 1023
     with pytest.raises(ImageError, match="full_scale"):
-        full_scale_of("x", floats, [Extent(0.9, whole=False)], bits=10)
+        scale(floats, bits=10, largest=0.9)
