@@ -21,7 +21,6 @@ from io import BytesIO
 import numpy as np
 from PIL import Image
 
-from beers_deploy.model.metrics.bootstrap import site_interval
 from beers_deploy.model.metrics.fidelity import fidelity_db
 from beers_deploy.model.progress import steps
 from beers_deploy.profiles.errors import OptionError
@@ -29,7 +28,7 @@ from beers_deploy.profiles.figures import Row, measured
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.studies.evaluation.methods import DEGRADED, Method
 from beers_deploy.studies.evaluation.pairs import NamedPair
-from beers_deploy.studies.evaluation.scores import inner
+from beers_deploy.studies.evaluation.scores import inner, mean_over_sites
 
 GAIN = "gain of restoring before compression"
 LOSSLESS = "lossless rate"
@@ -186,11 +185,8 @@ class Trial:
         ground = self.ground_db[shares, np.arange(len(shares))]
         gain = self.board_db - ground
         source = f"mean of {len(gain)} pairs"
-        interval, words = site_interval(gain.tolist(), self.sites, np.random.default_rng(seed))
         figures = {
-            "on board minus on the ground": measured(
-                float(gain.mean()), "dB", f"{source}, {words}", interval
-            )
+            "on board minus on the ground": mean_over_sites(gain, self.sites, seed, "dB", source)
         }
         means = {
             "restored on board": (self.board_db, "dB"),

@@ -29,6 +29,7 @@ from beers_deploy.profiles.shipped import BLIND as NOT_KNOWN
 from beers_deploy.profiles.shipped import BLIND_PROFILE
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.restoration.method import Restore, network_method
+from beers_deploy.restoration.plan import Plan
 from beers_deploy.restoration.steps import BOTH, Around, exposures_of
 
 logger = logging.getLogger(__name__)
@@ -185,7 +186,11 @@ def method_of(
 
 
 def network_restore(
-    network: Network, sensor: Sensor, reference: Instrument, around: Around
+    network: Network,
+    sensor: Sensor,
+    reference: Instrument,
+    around: Around,
+    plan_of: Callable[[tuple[int, ...]], Plan] | None = None,
 ) -> Restore:
     """Build the function that restores an image by a network and the steps around it.
 
@@ -197,6 +202,7 @@ def network_restore(
         around: the steps that are used: exposures, at which parts of the image are multiplied by a
             factor before the network, and the consistency step, which makes the result agree with
             the raw image.
+        plan_of: returns the tiles of an image, given its shape (H, W); None for the default ones.
 
     Returns:
         A function from degraded to restored digital numbers, (H, W) each.
@@ -208,7 +214,7 @@ def network_restore(
     aim = None
     if around.consistency and sensor.name != NOT_KNOWN:
         aim = reference.in_units_of(instrument)
-    return network_method(network.model, instrument.max_dn, exposed, instrument, aim)
+    return network_method(network.model, instrument.max_dn, exposed, instrument, aim, plan_of)
 
 
 def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:

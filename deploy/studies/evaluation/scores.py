@@ -6,7 +6,7 @@ hardly any border.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -26,6 +26,25 @@ from beers_deploy.studies.evaluation.targets import snr_name
 
 Perceptual = Callable[[np.ndarray, np.ndarray], float]
 """Computes the distance of two images (H, W) in [0, 1] of full scale."""
+Part = Callable[[np.ndarray], np.ndarray]
+"""Returns the part of an image (H, W) that counts."""
+
+
+def mean_over_sites(
+    values: Sequence[float] | np.ndarray, sites: Sequence[str], seed: int, unit: str, source: str
+) -> Figure:
+    """Average a score over images, with the bootstrap interval over their sites.
+
+    Args:
+        values: the score of each of N images, (N,).
+        sites: the site of each image; images of one site resemble one another.
+        seed: the seed of the bootstrap. With one seed, the intervals of all scores come from the
+            same draws of sites.
+        unit: the unit of the score.
+        source: what the values were measured on, in words.
+    """
+    interval, words = site_interval(values, sites, np.random.default_rng(seed))
+    return measured(float(np.mean(values)), unit, f"{source}, {words}", interval)
 
 
 def perceptual_distances(place: Path | None) -> dict[str, Perceptual | str]:
@@ -161,15 +180,19 @@ class Instruments:
         Returns:
             The scores by name, in the units that `figure` states; None if one is unavailable.
         """
-        psnr, before = (self._psnr_db(image, pair.reference, pair) for image in (dn, pair.degraded))
+
+        def psnr_db(reference: np.ndarray, part: Part = np.asarray) -> float:
+            return fidelity_db(part(dn), part(reference), part(pair.degraded), self.max_dn)
+
         clean = pair.noise_free
-        scores: dict[str, float | None] = {"PSNR": psnr}
-        scores[NOISE_FREE] = None if clean is None else self._psnr_db(dn, clean, pair)
-        inside = replace(pair, degraded=inner(pair.degraded), reference=inner(pair.reference))
-        scores[INNER] = self._psnr_db(inner(dn), inside.reference, inside)
-        scores[INNER_NOISE_FREE] = (
-            None if clean is None else self._psnr_db(inner(dn), inner(clean), inside)
-        )
+        psnr = psnr_db(pair.reference)
+        before = fidelity_db(pair.degraded, pair.reference, pair.degraded, self.max_dn)
+        scores: dict[str, float | None] = {
+            "PSNR": psnr,
+            NOISE_FREE: None if clean is None else psnr_db(clean),
+            INNER: psnr_db(pair.reference, inner),
+            INNER_NOISE_FREE: None if clean is None else psnr_db(clean, inner),
+        }
         # Two infinite PSNRs have no difference, and are equal.
         scores["PSNR gain"] = psnr - before if psnr != before else 0.0
         # A clipped pixel has lost light before any method sees it: it does not count as an error.
@@ -183,23 +206,13 @@ class Instruments:
             scores[name] = None if isinstance(distance, str) else distance(*both)
         return scores
 
-    def _psnr_db(self, dn: np.ndarray, reference: np.ndarray, pair: NamedPair) -> float:
-        return fidelity_db(dn, reference, pair.degraded, self.max_dn)
-
-    def figure(
-        self,
-        key: str,
-        value: float | None,
-        source: str,
-        interval: tuple[float, float] | None = None,
-    ) -> Figure:
+    def figure(self, key: str, value: float | None, source: str) -> Figure:
         """Convert a score to a figure with unit and source.
 
         Args:
             key: the name of the score.
             value: the value of the score, or None.
             source: what the value was measured on, in words.
-            interval: the interval of the value, or None.
 
         Returns:
             The figure. It is unavailable, with the reason, if the value is None or not finite.
@@ -210,7 +223,7 @@ class Instruments:
             return unavailable(unit, READ if without_clean else str(self.perceptual[key]))
         if not np.isfinite(value):
             return unavailable(unit, BLACK if key == BIAS else IDENTICAL)
-        return measured(value, unit, source, interval)
+        return measured(value, unit, source)
 
     def means(
         self, scores: Sequence[Mapping[str, float | None]], sites: Sequence[str], seed: int
@@ -236,10 +249,9 @@ class Instruments:
                 figures[key] = self.figure(key, first, "")
                 continue
             values, places = zip(*usable, strict=True)
-            # The same seed for each score: all intervals come from the same draws of sites.
-            interval, words = site_interval(values, places, np.random.default_rng(seed))
-            source = f"mean of {len(values)} pairs from {len(set(places))} sites, {words}"
-            figures[key] = self.figure(key, float(np.mean(values)), source, interval)
+            source = f"mean of {len(values)} pairs from {len(set(places))} sites"
+            unit = UNITS.get(key, DISTANCE)
+            figures[key] = mean_over_sites(values, places, seed, unit, source)
             if key == BIAS:
                 largest, site = max(usable, key=lambda pair: abs(pair[0]))
                 figures[LARGEST_BIAS] = self.figure(

@@ -13,12 +13,11 @@ from typing import cast
 
 import numpy as np
 
-from beers_deploy.model.metrics.bootstrap import site_interval
 from beers_deploy.model.metrics.fidelity import fidelity_db
 from beers_deploy.model.progress import steps
 from beers_deploy.model.raster.images import site_of
 from beers_deploy.model.simulator.procedural import load_scenes
-from beers_deploy.profiles.figures import Figure, Row, measured
+from beers_deploy.profiles.figures import Figure, Row
 from beers_deploy.profiles.instrument import Instrument, noise_from_snr
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.evaluation.methods import (
@@ -35,7 +34,7 @@ from beers_deploy.studies.evaluation.pairs import (
     simulate_pairs,
     table_at,
 )
-from beers_deploy.studies.evaluation.scores import NOISE_FREE
+from beers_deploy.studies.evaluation.scores import NOISE_FREE, mean_over_sites
 from beers_deploy.studies.evaluation.target_scenes import acquire_edges
 from beers_deploy.studies.evaluation.targets import restored_mtf
 
@@ -302,9 +301,5 @@ class SweepResult:
         """Return the mean of (N,) dB, one value for each image. For differences on the same images
         the interval is a paired one.
         """
-        interval, words = site_interval(
-            values.tolist(), self.sites, np.random.default_rng(self.seed)
-        )
-        return measured(
-            float(values.mean()), "dB", f"mean of {len(values)} pairs, {words}", interval
-        )
+        source = f"mean of {len(values)} pairs"
+        return mean_over_sites(values, self.sites, self.seed, "dB", source)

@@ -89,15 +89,16 @@ def target_row(method: Method, targets: Targets) -> Row:
     return Row(TARGETS, method.name, figures, {"sensor": method.sensor_known})
 
 
-def interval_of_mean(values: Sequence[float]) -> tuple[float, float]:
-    """Return the lower and upper end of the 90 % interval of the mean of two or more independent
-    values, by Student's t distribution.
+def _mean(values: Sequence[float], unit: str, source: str) -> Figure:
+    """Return the mean of two or more independent values, with its 90 % interval by Student's t
+    distribution.
     """
     mean = float(np.mean(values))
     reach = (
         float(stdtrit(len(values) - 1, 0.95)) * float(np.std(values, ddof=1)) / len(values) ** 0.5
     )
-    return mean - reach, mean + reach
+    words = f"{source}, 90 % interval of the mean"
+    return measured(mean, unit, words, (mean - reach, mean + reach))
 
 
 def restored_mtf(method: Method, edges: Edges, max_dn: int) -> Figure:
@@ -134,8 +135,7 @@ def mtf_figure(edges: Sequence[float | Refusal]) -> Figure:
         return unavailable(
             "%", f"{len(refusals)} of {len(edges)} edges refused: {refusals[0].reason}"
         )
-    source = f"{len(values)} of {len(edges)} simulated slanted edges, 90 % interval of the mean"
-    return measured(float(np.mean(values)), "%", source, interval_of_mean(values))
+    return _mean(values, "%", f"{len(values)} of {len(edges)} simulated slanted edges")
 
 
 def snr_name(radiance: float) -> str:
@@ -198,12 +198,8 @@ def flux_figures(method: Method, points: Points) -> dict[str, Figure]:
         values[point_radiance(row, column)].append(flux)
     figures = {}
     for radiance, fluxes in values.items():
-        source = (
-            f"mean of {len(fluxes)} points in {APERTURE_PX} x {APERTURE_PX} px, 90 % "
-            "interval of the mean"
-        )
-        name = flux_name(radiance, points.background)
-        figures[name] = measured(float(np.mean(fluxes)), "%", source, interval_of_mean(fluxes))
+        source = f"mean of {len(fluxes)} points in {APERTURE_PX} x {APERTURE_PX} px"
+        figures[flux_name(radiance, points.background)] = _mean(fluxes, "%", source)
     return figures
 
 
@@ -227,8 +223,8 @@ def transfer_figure(method: Method, patterns: Sequence[Pattern]) -> Figure:
     values: list[float] = []
     for pattern in patterns:
         values += _transfers(method.restore(pattern.acquired), pattern)
-    source = f"{len(values)} parts of {len(patterns)} simulated patterns, 90 % interval of the mean"
-    return measured(float(np.mean(values)), OF_REFERENCE, source, interval_of_mean(values))
+    source = f"{len(values)} parts of {len(patterns)} simulated patterns"
+    return _mean(values, OF_REFERENCE, source)
 
 
 def _transfers(restored: np.ndarray, pattern: Pattern) -> list[float]:

@@ -16,10 +16,11 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import sensor_names
 from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.samples.simulated import Calibration
-from beers_deploy.restoration.method import Restore, network_method
+from beers_deploy.restoration.method import Restore
 from beers_deploy.restoration.plan import Plan, make_plan
+from beers_deploy.restoration.steps import BOTH
 from beers_deploy.restoration.tiles.exposures import tiles_by_factor
-from beers_deploy.studies.evaluation.methods import Method
+from beers_deploy.studies.evaluation.methods import Method, network_restore
 from beers_deploy.studies.evaluation.pairs import NamedPair
 from beers_deploy.studies.evaluation.scores import DETAILS, Instruments, perceptual_distances
 from beers_deploy.studies.tradeoff.points import (
@@ -99,7 +100,10 @@ class Benchmark:
         """
         if point.halo_px is None:
             return self.score(exact)
-        return self.score(restore_in_tiles(point, self.degraded, self.reference), exact)
+        network = network_of_variant(point.variant)
+        tiles = partial(tiles_of_point, point)
+        in_tiles = network_restore(network, self.degraded, self.reference.nominal(), BOTH, tiles)
+        return self.score(in_tiles, exact)
 
     def runs(self, point: Point) -> float:
         """Return how often the network of an operating point runs on a tile, as the mean over the
@@ -161,26 +165,6 @@ class Benchmark:
             source = f"mean difference from exact seams, {len(errors)} images in these tiles"
             figures[SEAM_ERROR] = measured(float(np.mean(errors)), "DN", source)
         return figures
-
-
-def restore_in_tiles(point: Point, degraded: Sensor, reference: Sensor) -> Restore:
-    """Build the function that restores an image by a network in the tiles of an operating point,
-    with the exposures and the consistency step that `restore` uses.
-
-    Args:
-        point: an operating point of a network.
-        degraded: the sensor of the images.
-        reference: the sensor that the restoration aims at.
-
-    Returns:
-        A function from degraded to restored digital numbers, (H, W) each.
-    """
-    source = network_of_variant(point.variant)
-    sensor = degraded.nominal()
-    brighter = {factor: other.model for factor, other in source.exposures.items()}
-    aim = reference.nominal().in_units_of(sensor)
-    tiles = partial(tiles_of_point, point)
-    return network_method(source.model, sensor.max_dn, brighter, sensor, aim, tiles)
 
 
 def tiles_of_point(point: Point, shape: tuple[int, ...]) -> Plan:

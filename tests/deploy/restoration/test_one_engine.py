@@ -14,11 +14,11 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration import method
 from beers_deploy.restoration.plan import Tiles, plan_for
 from beers_deploy.restoration.runtime import open_runtime
-from beers_deploy.restoration.steps import step_for
+from beers_deploy.restoration.steps import BOTH, step_for
 from beers_deploy.restoration.tiles.rows import restore_floats
-from beers_deploy.studies.evaluation.methods import method_named
+from beers_deploy.studies.evaluation.methods import method_named, network_restore
 from beers_deploy.studies.stress.networks import Runner
-from beers_deploy.studies.tradeoff.measure import restore_in_tiles
+from beers_deploy.studies.tradeoff.measure import tiles_of_point
 from beers_deploy.studies.tradeoff.points import FLOAT, INT8, Point, Variant
 from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import restored
@@ -66,7 +66,9 @@ def ways(path: Path, tile_px: int, halo_px: int) -> Mapping[str, Restored]:
         "the library and the demo": partial(
             restore, network=path, tile=tile_px, halo=halo_px, sensor=SENSOR
         ),
-        "tradeoff": restore_in_tiles(point, SENSOR, REFERENCE),
+        "tradeoff": network_restore(
+            network, SENSOR, REFERENCE.nominal(), BOTH, partial(tiles_of_point, point)
+        ),
         "the engine": lambda dn: restore_floats(dn, infer, plan, consistency=steps),
     }
 
