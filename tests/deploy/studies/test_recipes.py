@@ -52,13 +52,6 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return paths
 
 
-def image_options(folders: list[Path]) -> list[str]:
-    words: list[str] = []
-    for folder in folders:
-        words += ["--images", str(folder)]
-    return words
-
-
 @pytest.mark.slow
 def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes(
     folders: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -67,7 +60,8 @@ def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes
     recipe = tmp_path / "own.toml"
     out = tmp_path / "run"
     recipe.write_text(RECIPE)
-    command = ["train", "--recipe", recipe, *image_options(folders), "--out", out]
+    images = "--images", folders[0], "--images", folders[1]
+    command = "train", "--recipe", recipe, *images, "--out", out
     done(*command)
     names = [f"own{end}" for end in (".safetensors", "-int8.onnx", ".md")]
     first = [(out / name).read_bytes() for name in names]
@@ -87,29 +81,16 @@ def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes
     for name in names:
         (out / name).unlink()
     for path in (out / "2-rounded").iterdir():
-        path.unlink()
+        if path.name != "start-int8.onnx":
+            path.unlink()
     assert "Add --resume" in refused(*command)
     done(*command, "--resume")
     assert [(out / name).read_bytes() for name in names] == first
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (
-            ["--variant", "convbeers-xs"],
-            "--variant has no effect with --recipe, which states it",
-        ),
-        (["--conditioned"], "--conditioned has no effect with --recipe"),
-        ([], "--recipe needs --images"),
-    ],
-)
-def test_what_a_recipe_states_or_needs_is_said(
-    options: list[str], words: str, tmp_path: Path
-) -> None:
-    assert words in refused(
-        "train", "--recipe", "convbeers-xs", "--out", tmp_path / "run", *options
-    )
+def test_a_recipe_needs_images(tmp_path: Path) -> None:
+    command = "train", "--recipe", "convbeers-xs", "--out", tmp_path / "run"
+    assert "--recipe needs --images" in refused(*command)
     assert not (tmp_path / "run").exists()
 
 
@@ -117,12 +98,5 @@ def test_a_held_out_site_that_no_folder_shows_is_refused(
     folders: list[Path], tmp_path: Path
 ) -> None:
     (tmp_path / "own.toml").write_text(RECIPE)
-    message = refused(
-        "train",
-        "--recipe",
-        tmp_path / "own.toml",
-        *image_options(folders[:1]),
-        "--out",
-        tmp_path / "run",
-    )
-    assert "'town' is to be held out" in message
+    command = "train", "--recipe", tmp_path / "own.toml", "--out", tmp_path / "run"
+    assert "'town' is to be held out" in refused(*command, "--images", folders[0])

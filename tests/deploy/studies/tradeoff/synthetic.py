@@ -7,7 +7,7 @@ import onnx
 
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.network import Network
-from beers_deploy.profiles.figures import measured, predicted
+from beers_deploy.profiles.figures import Figure, measured, predicted
 from beers_deploy.studies.tradeoff.front import Comparison, Measured
 from beers_deploy.studies.tradeoff.points import INT8, Point, Variant
 
@@ -18,13 +18,16 @@ COMPARE = Comparison(SITES, 0)
 DPU = load_dpu("vck190")
 
 
+def made_up(value: float, unit: str, factor: float) -> Figure:
+    return predicted(value, unit, (value / factor, value * factor), "made up")
+
+
 def synthetic(
     name: str,
     psnr_db: float,
     latency_s: float,
     *,
     scatter_db: float = 0.01,
-    tile_px: int = 640,
     method: str = "",
     board: str = "vck190",
     power_w: float = 30.0,
@@ -40,26 +43,14 @@ def synthetic(
         name,
         {
             "PSNR": measured(psnr_db, "dB", "made up", (psnr_db - 3, psnr_db + 3)),
-            "SSIM": measured(psnr_db / 50, "ratio", "made up"),
             "host p50": measured(latency_s / 10, "s/Mpx", "made up"),
-            "board latency": predicted(
-                latency_s, "s", (latency_s / 1.6, latency_s * 1.6), "made up"
-            ),
-            "board power": predicted(power_w, "W", (power_w / 2, power_w * 2), "made up"),
-            "board energy": predicted(
-                latency_s * power_w, "J", (latency_s * 15, latency_s * 60), "made up"
-            ),
+            "board latency": made_up(latency_s, "s", 1.6),
+            "board power": made_up(power_w, "W", 2),
+            "board energy": made_up(latency_s * power_w, "J", 2),
         },
-        {
-            "board": board,
-            "configuration": DPU.name,
-            "tile": "640",
-            "halo": "exact",
-            "method": name,
-            "sensor": "known",
-        },
-        Point(variant, DPU.target, DPU, tile_px),
-        [{"PSNR": float(value), "SSIM": float(value) / 50} for value in values],
+        {"board": board, "method": name},
+        Point(variant, DPU.target, DPU),
+        [{"PSNR": float(value)} for value in values],
     )
 
 

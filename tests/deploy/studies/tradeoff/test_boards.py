@@ -118,51 +118,26 @@ def test_a_board_that_the_budget_excludes_hides_no_other(boards: Sequence[str]) 
 
 
 def test_a_board_within_the_limits_is_compared_with_the_recommended_point() -> None:
-    study = weighed(
-        on_boards({"fast": 1.0, "slow": 3.0}, NETWORKS), ["slow", "fast"], "latency<=30s"
-    )
-    rows = {row.name: row for row in study.board_rows}
-    assert (
-        rows["slow"].text["verdict"]
-        == "the PSNR of the recommended point, for 3 times its board latency"
-    )
-    assert rows["slow"].figures["board power"].value == POWER_W["slow"]
-    tight = weighed(
-        on_boards({"fast": 1.0, "slow": 3.0}, NETWORKS), ["slow", "fast"], "latency<=4s"
-    )
-    rows = {row.name: row for row in tight.board_rows}
-    assert rows["slow"].text["verdict"].startswith("PSNR -1.6 [-1.6")
-    assert rows["slow"].text["point"] == "small on slow"
-
-
-def test_without_a_point_within_the_limits_the_nearest_is_named() -> None:
-    study = weighed(on_boards({"fast": 1.0}, NETWORKS), ["fast"], "latency<=1s", "psnr>=45")
-    assert study.best is None
-    assert not study
-    assert study.notes[0] == study.line
-    assert "no point keeps board latency <= 1 s and PSNR >= 45 dB; nearest is" in study.notes[1]
+    points = on_boards({"fast": 1.0, "slow": 3.0}, NETWORKS)
+    for budget, point, words in (
+        ("latency<=30s", "large", "the PSNR of the recommended point, for 3 times its board lat"),
+        ("latency<=4s", "small", "PSNR -1.6 [-1.6"),
+    ):
+        row, _ = weighed(points, ["slow", "fast"], budget).board_rows
+        assert row.text["point"] == f"{point} on slow"
+        assert row.text["verdict"].startswith(words)
+        assert row.figures["board power"].value == POWER_W["slow"]
 
 
 def test_what_a_board_lacks_or_refuses_is_said_with_its_reason() -> None:
     points = on_boards({"fast": 1.0, "slow": 3.0}, NETWORKS)
-    lacking = unavailable("W", "nobody measured it")
-    points = [
-        replace(point, figures={**point.figures, "board power": lacking})
-        if point.text["board"] == "slow"
-        else point
-        for point in points
-    ]
-    rows = {row.name: row for row in weighed(points, ["fast", "slow"], "power<=40").board_rows}
-    assert (
-        "no point has every figure asked for, such as board power" in rows["slow"].text["verdict"]
-    )
-    odd = synthetic("odd", 45.0, 1.0)
+    for point in points:
+        if point.text["board"] == "slow":
+            point.figures["board power"] = unavailable("W", "nobody measured it")
+    _, slow = weighed(points, ["fast", "slow"], "power<=40").board_rows
+    assert "no point has every figure asked for, such as board power" in slow.text["verdict"]
+    odd = synthetic("odd", 45.0, 1.0, board="this machine")
     assert odd.point is not None
-    misfit = replace(
-        odd,
-        figures={"PSNR": odd.figures["PSNR"]},
-        text={**odd.text, "board": "this machine"},
-        point=replace(odd.point, reason="frugal: a sigmoid", refused_by="frugal"),
-    )
-    rows = {row.name: row for row in weighed([*points, misfit], ["fast", "frugal"]).board_rows}
-    assert "odd does not fit its DPU: frugal: a sigmoid" in rows["frugal"].text["verdict"]
+    misfit = replace(odd, point=replace(odd.point, reason="frugal: a sigmoid", refused_by="frugal"))
+    _, frugal = weighed([*points, misfit], ["fast", "frugal"]).board_rows
+    assert "odd does not fit its DPU: frugal: a sigmoid" in frugal.text["verdict"]

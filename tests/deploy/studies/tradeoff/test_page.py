@@ -45,22 +45,17 @@ def words_of(result: Tradeoff) -> list[str]:
     return [text.text or "" for text in root.iter(f"{SVG}text")]
 
 
-def page() -> str:
-    result = study()
-    return render(report_of(result, plot_svg(result)))
-
-
 def test_of_several_boards_a_network_keeps_its_colour_and_a_board_its_marker() -> None:
     points = [
         replace(synthetic(name, 45.0, cost, board=board), name=f"{name} {board}")
         for cost, (name, board) in enumerate(product(("one", "other"), ("vck190", "zcu104")), 1)
     ]
-    lines = list(series(study(points, boards=("vck190", "zcu104"))))
+    result = study(points, boards=("vck190", "zcu104"))
+    lines = list(series(result))
     assert len({(line.name, line.colour) for line in lines}) == 2
     assert len({(line.board, line.marker) for line in lines}) == 2
     assert len({(line.colour, line.marker) for line in lines}) == 4
-    words = words_of(study(points, boards=("vck190", "zcu104")))
-    assert {"vck190", "zcu104", "one", "other"} <= set(words)
+    assert {"vck190", "zcu104", "one", "other"} <= set(words_of(result))
 
 
 @pytest.mark.parametrize("most_s", [9.9, 2_813.0, 4_200_000.0])
@@ -78,13 +73,10 @@ def test_every_label_lies_within_the_picture(most_s: float) -> None:
 
 
 def test_the_plot_marks_the_recommended_point_and_the_budget() -> None:
-    def words(budget: str | None) -> list[str]:
-        return words_of(study(budget=budget))
-
-    within = words("latency<=3s")
+    within = words_of(study(budget="latency<=3s"))
     assert {"recommended", "\N{LESS-THAN OR EQUAL TO} 3 s", "1", "4", "tiny", "slow"} <= set(within)
-    assert "recommended" not in words("latency<=0.1s")
-    assert not any("\N{LESS-THAN OR EQUAL TO}" in word for word in words(None))
+    assert "recommended" not in words_of(study(budget="latency<=0.1s"))
+    assert not any("\N{LESS-THAN OR EQUAL TO}" in word for word in words_of(study()))
 
 
 def test_the_pages_plot_is_the_file_beside_it(tmp_path: Path) -> None:
@@ -99,35 +91,29 @@ def test_the_pages_plot_is_the_file_beside_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("width_px", [1280, 390])
-def test_nothing_is_wider_than_the_window(width_px: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("width_px", "dark", "colours"), [(1280, False, LIGHT), (390, True, DARK)])
+def test_the_page_fits_the_window_follows_the_screen_and_is_sorted_by_a_press(
+    width_px: int, dark: bool, colours: dict[str, str], tmp_path: Path
+) -> None:
     look = """const image = document.images[0], root = document.documentElement;
-    const width = image.getBoundingClientRect().width;
-    return [root.scrollWidth - root.clientWidth, image.naturalWidth, width];"""
-    overflow_px, natural_px, displayed_px = seen(page(), look, tmp_path, width_px=width_px)
-    assert overflow_px <= 0
-    assert natural_px == SIZE_PX[0]
-    assert displayed_px > 340
-
-
-@pytest.mark.slow
-def test_a_press_on_a_heading_sorts_by_it_and_another_reverses(tmp_path: Path) -> None:
-    look = """const table = [...document.querySelectorAll("table.sortable")].at(-1);
+    const table = [...document.querySelectorAll("table.sortable")].at(-1);
     const heads = [...table.tHead.rows[0].cells];
     const head = heads.find((each) => each.textContent.startsWith("board latency"));
     const names = () => [...table.tBodies[0].rows].map((row) => row.cells[0].textContent);
+    const sizes = [root.scrollWidth - root.clientWidth, image.naturalWidth, image.width];
     head.click();
     const up = names();
     head.click();
-    return [up, names(), head.getAttribute("aria-sort")];"""
-    up, down, state = seen(page(), look, tmp_path)
+    const colour = getComputedStyle(root).getPropertyValue("--page").trim();
+    return [sizes, up, names(), head.getAttribute("aria-sort"), colour];"""
+    result = study()
+    html = render(report_of(result, plot_svg(result)))
+    sizes, up, down, state, colour = seen(html, look, tmp_path, width_px=width_px, dark=dark)
+    overflow_px, natural_px, displayed_px = sizes
+    assert overflow_px <= 0
+    assert natural_px == SIZE_PX[0]
+    assert displayed_px > 340
     assert up == ["tiny", "small", "medium", "slow", "large"]
     assert down == up[::-1]
     assert state == "descending"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("dark", "colours"), [(False, LIGHT), (True, DARK)])
-def test_the_page_follows_the_screen(dark: bool, colours: dict[str, str], tmp_path: Path) -> None:
-    look = "return getComputedStyle(document.documentElement).getPropertyValue('--page').trim();"
-    assert seen(page(), look, tmp_path, dark=dark) == colours["page"]
+    assert colour == colours["page"]
