@@ -29,6 +29,7 @@ from beers_deploy.model.pairs_recipe import read_pairs_recipe
 from beers_deploy.model.raster.images import list_images
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.pairs import Pair
+from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.report.page import Picture, Report, Section, write_report
@@ -130,6 +131,8 @@ def run_evaluation(plan: Plan) -> Evaluation:
         for number, pair in enumerate(plan.given):
             degraded, reference = (image.astype(np.float32) for image in pair)
             loaded.append(NamedPair(f"pair{number}", degraded, reference, noise_free=pair.clean))
+        if not loaded:
+            raise OptionError("There are no `pairs`. Give at least one.")
     elif plan.folder is not None:
         loaded = read_pairs(plan.folder, nominal.max_dn, read_pairs_recipe(plan.folder))
         sensor_rows = [_sensor_row(loaded, sensors[0], str(plan.folder), plan.strict)]
@@ -278,11 +281,11 @@ def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -
     """Draw a picture of crops, as `strip_of` does, of one pair of each of the first few sites, and
     write it to OUT/SITE.png.
     """
-    # Reversed, so that the first pair of each site is the one that stays.
-    by_site = {pair.site: pair for pair in reversed(pairs)}
-    sites = list(dict.fromkeys(pair.site for pair in pairs))[:SITES]
+    by_site: dict[str, NamedPair] = {}
+    for pair in pairs:
+        by_site.setdefault(pair.site, pair)
     strips = []
-    for pair in (by_site[site] for site in sites):
+    for pair in list(by_site.values())[:SITES]:
         strip, white = strip_of(pair, methods)
         with whole_file(out / f"{pair.site}.png") as temporary:
             Image.fromarray(strip).save(temporary, "PNG", optimize=True)

@@ -289,34 +289,34 @@ def score(
     return [Row("mean", method.name, means, {"sensor": method.sensor_known}), *rows]
 
 
-def site_rows(rows: Sequence[Row]) -> list[Row]:
+def site_rows(images: Sequence[Row]) -> list[Row]:
     """Average the scores of single images by site, in one table for each score but the gain.
 
     Args:
-        rows: the rows of an evaluation, of which those of the table 'images' are used.
+        images: the rows of an evaluation's table 'images'.
 
     Returns:
         The rows of the tables 'SCORE by site': a row for each site, with a column for each method.
     """
-    images = [row for row in rows if row.table == "images"]
     keys = [
         key
         for key in images[0].figures
         if key != "PSNR gain" and any(row.figures[key].value is not None for row in images)
     ]
-    sites = dict.fromkeys(row.text["site"] for row in images)
-    methods = dict.fromkeys(row.name.split(": ")[0] for row in images)
+    sites: dict[str, dict[str, list[Row]]] = {}
+    for row in images:
+        # A row is named METHOD: PAIR, and a user's method may have a colon in its name.
+        method = row.name.rpartition(": ")[0]
+        sites.setdefault(row.text["site"], {}).setdefault(method, []).append(row)
     rows = []
-    for key, site in product(keys, sites):
-        here = [row for row in images if row.text["site"] == site]
+    for key, (site, methods) in product(keys, sites.items()):
         figures: dict[str, Figure] = {}
-        for method in methods:
-            own = [row.figures[key] for row in here if row.name.startswith(f"{method}: ")]
-            values = [figure.value for figure in own if figure.value is not None]
-            source = f"mean {key} of {len(values)} pairs"
-            figures[method] = (
-                measured(float(np.mean(values)), own[0].unit, source) if values else own[0]
-            )
+        for method, own in methods.items():
+            values = [value for row in own if (value := row.figures[key].value) is not None]
+            figures[method] = own[0].figures[key]
+            if values:
+                source = f"mean {key} of {len(values)} pairs"
+                figures[method] = measured(float(np.mean(values)), figures[method].unit, source)
         rows.append(Row(f"{key} by site", site, figures, {"images": str(len(own))}))
     return rows
 

@@ -211,7 +211,7 @@ def measure_host(
 
 
 def host_times(restores: Iterable[Restore], tile: np.ndarray) -> list[list[float]]:
-    """Time methods on one tile on this machine, after one warm-up run of each.
+    """Time methods on one tile on this machine, after a warm-up round.
 
     Args:
         restores: functions from degraded to restored digital numbers (H, W).
@@ -221,9 +221,8 @@ def host_times(restores: Iterable[Restore], tile: np.ndarray) -> list[list[float
         For each method the seconds of `ROUNDS` runs. In each round every method runs once.
     """
     calls = [partial(restore, tile) for restore in restores]
-    for call in calls:
-        call()
-    return [[time_s for time_s, _ in samples] for samples in interleaved(calls, ROUNDS)]
+    rounds = interleaved(calls, 1 + ROUNDS)
+    return [[time_s for time_s, _ in samples[1:]] for samples in rounds]
 
 
 def host_figures(times_s: Sequence[float], pixels: int) -> dict[str, Figure]:

@@ -53,6 +53,11 @@ def test_the_command_on_a_folder_of_pairs(tmp_path: Path, monkeypatch: pytest.Mo
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.png", "b.png", "report.html"]
 
 
+def test_no_pair_at_all_is_refused() -> None:
+    with pytest.raises(OptionError, match="no `pairs`"):
+        evaluate(methods=["degraded"], pairs=[])
+
+
 @pytest.mark.parametrize("brightness", [(0.0,), (1.5,), (float("nan"),)])
 def test_a_brightness_out_of_range_is_refused(brightness: tuple[float, ...]) -> None:
     with pytest.raises(OptionError, match=r"`brightness` .* above 0 and at most 1"):

@@ -131,6 +131,9 @@ def test_sites_are_means_of_their_images() -> None:
     pairs = [pair("a_1.tif", 1, 10), pair("a_2.tif", 2, 40), pair("b_1.tif", 3, 20)]
     _, *images = score(IDENTITY, pairs, PLAIN, 0)
     rows = site_rows(images)
+    colon = score(replace(IDENTITY, name="degraded: more"), pairs, PLAIN, 0)[1:]
+    both = site_rows([*images, *colon])[0].figures
+    assert both["degraded"] == both["degraded: more"] == rows[0].figures["degraded"]
     keys = ["PSNR", INNER, BIAS, "SSIM"]
     assert list(by_table(rows)) == [f"{key} by site" for key in keys]
     known = [replace(one, noise_free=one.reference) for one in pairs]
