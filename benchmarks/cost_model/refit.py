@@ -85,9 +85,7 @@ def cost_table(board: str) -> Iterator[tuple[str, str, str, str]]:
         "with every rate"
     )
     yield "families_held", f"{coverage(validation.rows)[1]:.2f}", "inferred", covered
-    off = by_network(
-        (row.network for row in validation.rows), (row.rates for row in validation.rows)
-    )
+    off = by_network(validation.rows)
     mean_error = "mean |predicted / published - 1| of the networks, each left out with its family"
     yield "error_left_out", f"{off.mean():.3f}", "inferred", mean_error
     on_dpu = validation.widths[: PARTS.index("copies")]
@@ -129,9 +127,7 @@ def accuracy() -> Iterator[tuple[object, ...]]:
     yield "board", "networks", "families", "rates", *errors, *held
     for board in boards():
         validation = nested(board)
-        off = by_network(
-            (row.network for row in validation.rows), (row.rates for row in validation.rows)
-        )
+        off = by_network(validation.rows)
         covered, total = coverage(validation.rows)
         counts = (
             len(off),
@@ -169,9 +165,8 @@ def by_kind() -> Iterator[tuple[object, ...]]:
             rows = [row for row in nested(board).rows if NETWORKS[row.network].kind == kind]
             if not rows:
                 continue
-            errors = [row.network for row in rows], [row.rates for row in rows]
-            off = by_network(*errors)
-            bias = by_network(*errors, signed=True).mean()
+            off = by_network(rows)
+            bias = by_network(rows, signed=True).mean()
             counts = len(off), sum(len(row.rates) for row in rows)
             median, mean, largest = _spread(off)
             yield (

@@ -241,7 +241,7 @@ def pair_width(board: str) -> float:
     """
     trial = _trial(board, chosen(board))
     cases = trial.cases
-    names = np.array([row.network for row in trial.cases.rows])
+    names = np.array([row.network for row in cases.rows])
     errors = np.zeros(len(names))
     for name in dict.fromkeys(names):
         errors[names == name] = cases.only(names == name).errors(
@@ -272,14 +272,14 @@ def outside_width(cases: Cases, share: float = 0.25) -> float:
     return family_quantile(tested.errors(fit(cases.only(~large))), tested.families)
 
 
-def by_network(names: Iterable[str], errors: Iterable[Array], *, signed: bool = False) -> Array:
+def by_network(rows: Iterable[LeftOut], *, signed: bool = False) -> Array:
     """Mean |predicted / published - 1| of each network, or with its sign, over its configurations
     and rates.
     """
     by_name: dict[str, list[float]] = {}
-    for name, logs in zip(names, errors, strict=True):
-        off = np.expm1(logs)
-        by_name.setdefault(name, []).extend((off if signed else np.abs(off)).tolist())
+    for row in rows:
+        off = np.expm1(row.rates)
+        by_name.setdefault(row.network, []).extend((off if signed else np.abs(off)).tolist())
     return np.array([np.mean(values) for values in by_name.values()])
 
 
