@@ -10,7 +10,7 @@ import beers_deploy as bd
 from beers_deploy.profiles.errors import MissingExtraError, OptionError
 from beers_deploy.profiles.shipped import HERE, board_names
 from beers_deploy.quant.onnx_file import metadata
-from beers_deploy.studies.demo import load_sensors, read_input
+from beers_deploy.studies import demo
 from tests.deploy.command_line import done
 from tests.deploy.documents import figures_of, valid
 
@@ -59,15 +59,18 @@ def test_a_missing_package_is_named_before_anything_is_written(
 
 
 @pytest.mark.slow
-def test_the_reference_has_the_gain_of_the_sensor_named(tmp_path: Path) -> None:
+def test_the_reference_has_the_gain_of_the_sensor_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Else every pixel of the scene would be off by the ratio of the gains, and the PSNR would say
     so.
     """
+    monkeypatch.setattr(demo, "SIDE_PX", 128)
     text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
     (tmp_path / "mine.toml").write_text(text.replace("10.2375", "5.0"))
-    pair = read_input(None, 0, load_sensors(str(tmp_path / "mine.toml")))[1]
+    pair = demo.read_input(None, 0, demo.load_sensors(str(tmp_path / "mine.toml")))[1]
     assert pair is not None
     assert abs(float(pair.degraded.mean() / pair.reference.mean()) - 1) < 0.01
     (tmp_path / "wide.toml").write_text(text.replace("bits = { value = 12", "bits = { value = 14"))
     with pytest.raises(OptionError, match=r"`sensor` must have 12 bits, but wide has 14\."):
-        load_sensors(str(tmp_path / "wide.toml"))
+        demo.load_sensors(str(tmp_path / "wide.toml"))

@@ -39,6 +39,11 @@ def boxes_of(labelled: LabelledSet) -> dict[str, list[tuple[object, ...]]]:
     }
 
 
+def by_voc(folder: Path, content: str, name: str = "a.xml") -> Path:
+    """Write an image a.png and a file of labels next to it."""
+    return text(image(folder / "a.png").with_name(name), content)
+
+
 def refused(folder: Path, sentence: str) -> None:
     with pytest.raises(OptionError, match=sentence) as error:
         read_labelled(folder)
@@ -113,11 +118,8 @@ def test_the_four_photographs_are_read_with_their_boxes(shared_data: Path) -> No
 
 
 def test_boxes_outside_or_without_area_are_left_out_and_told(tmp_path: Path) -> None:
-    image(tmp_path / "a.png")
-    text(
-        tmp_path / "a.xml",
-        xml([("ship", 5, 5, 9, 9), ("ship", 70, 5, 90, 9), ("ship", 9, 9, 9, 20)]),
-    )
+    boxes: list[Object] = [("ship", 5, 5, 9, 9), ("ship", 70, 5, 90, 9), ("ship", 9, 9, 9, 20)]
+    by_voc(tmp_path, xml(boxes))
     labelled = read_labelled(tmp_path)
     assert boxes_of(labelled)["a"] == [("ship", 5, 5, 9, 9)]
     assert labelled.notes == [
@@ -135,13 +137,10 @@ def test_labels_of_an_image_of_another_size_are_refused(tmp_path: Path) -> None:
     [
         (lambda folder: image(folder / "a.png"), "but it has 0 .json files"),
         (
-            lambda folder: text(image(folder / "a.png").with_name("b.xml"), xml([])),
+            lambda folder: by_voc(folder, xml([]), "b.xml"),
             "1 of 1 files are missing in .*, the first 'a.xml'",
         ),
-        (
-            lambda folder: text(image(folder / "a.png").with_name("a.xml"), xml([])),
-            "none on 1 images",
-        ),
+        (lambda folder: by_voc(folder, xml([])), "none on 1 images"),
         (lambda folder: folder, "there is no image in it"),
         (lambda folder: text(text(coco(folder) / "b.json", "{}"), "{}"), "it has 2 .json files"),
     ],
@@ -167,7 +166,7 @@ def test_a_folder_without_labelled_images_is_refused(
 def test_a_faulty_voc_file_is_refused_by_a_sentence(
     content: str, sentence: str, tmp_path: Path
 ) -> None:
-    text(image(tmp_path / "a.png").with_name("a.xml"), content)
+    by_voc(tmp_path, content)
     refused(tmp_path, sentence)
 
 

@@ -8,6 +8,7 @@ import onnx
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.network import Network
 from beers_deploy.profiles.figures import Figure, measured, predicted
+from beers_deploy.studies.tradeoff.advice import Question, parse_constraints
 from beers_deploy.studies.tradeoff.front import Comparison, Measured
 from beers_deploy.studies.tradeoff.points import INT8, Point, Variant
 
@@ -52,6 +53,11 @@ def synthetic(
         Point(variant, DPU.target, DPU),
         [{"PSNR": float(value)} for value in values],
     )
+
+
+def question(budget: str | None = None, need: str | None = None) -> Question:
+    """Ask for a point within limits, as a user writes them."""
+    return Question(parse_constraints("budget", budget), parse_constraints("need", need), COMPARE)
 
 
 def family() -> Sequence[Measured]:

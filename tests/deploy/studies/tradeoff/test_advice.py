@@ -14,7 +14,6 @@ from beers_deploy.profiles.figures import Figure, measured, predicted, published
 from beers_deploy.studies.tradeoff.advice import (
     NAMES,
     Constraint,
-    Question,
     parse_constraints,
     recommend,
 )
@@ -30,7 +29,7 @@ from beers_deploy.studies.tradeoff.front import (
     significant,
     verdict,
 )
-from tests.deploy.studies.tradeoff.synthetic import COMPARE, DPU, family, synthetic
+from tests.deploy.studies.tradeoff.synthetic import COMPARE, DPU, family, question, synthetic
 
 COST = "board latency"
 PLACES = st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9)), min_size=1, max_size=12)
@@ -126,8 +125,7 @@ def test_front_rows_compare_each_member_with_the_next_cheaper_one() -> None:
 
 def recommendation(budget: str | None = None, need: str | None = None) -> tuple[str | None, str]:
     """The name of the point to take, and the line that says so."""
-    asked = Question(parse_constraints("budget", budget), parse_constraints("need", need), COMPARE)
-    point, line = recommend(family(), asked)
+    point, line = recommend(family(), question(budget, need))
     return point.name if point else None, line
 
 

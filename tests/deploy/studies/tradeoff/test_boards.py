@@ -9,11 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.profiles.figures import unavailable
-from beers_deploy.studies.tradeoff.advice import Question, parse_constraints
 from beers_deploy.studies.tradeoff.front import Measured
 from beers_deploy.studies.tradeoff.page import Tradeoff
 from beers_deploy.studies.tradeoff.run import weigh
-from tests.deploy.studies.tradeoff.synthetic import COMPARE, synthetic
+from tests.deploy.studies.tradeoff.synthetic import question, synthetic
 
 BOARDS = ("fast", "frugal", "slow")
 POWER_W = {"fast": 30.0, "frugal": 12.0, "slow": 20.0}
@@ -25,10 +24,7 @@ def weighed(
     budget: str | None = None,
     need: str | None = None,
 ) -> Tradeoff:
-    question = Question(
-        parse_constraints("budget", budget), parse_constraints("need", need), COMPARE
-    )
-    return weigh(points, boards, question)
+    return weigh(points, boards, question(budget, need))
 
 
 def on_boards(costs: dict[str, float], psnr_db: dict[str, float]) -> list[Measured]:

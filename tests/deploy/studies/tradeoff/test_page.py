@@ -11,7 +11,6 @@ import pytest
 
 from beers_deploy.report.page import render
 from beers_deploy.report.plots import DARK, LIGHT, look
-from beers_deploy.studies.tradeoff.advice import Question, parse_constraints
 from beers_deploy.studies.tradeoff.front import Measured
 from beers_deploy.studies.tradeoff.page import (
     SIZE_PX,
@@ -23,7 +22,7 @@ from beers_deploy.studies.tradeoff.page import (
 )
 from beers_deploy.studies.tradeoff.run import weigh
 from tests.deploy.browser import seen
-from tests.deploy.studies.tradeoff.synthetic import COMPARE, family, synthetic
+from tests.deploy.studies.tradeoff.synthetic import family, question, synthetic
 
 SVG = "{http://www.w3.org/2000/svg}"
 BOARDS = ("vck190",)
@@ -35,8 +34,7 @@ def study(
     boards: tuple[str, ...] = BOARDS,
 ) -> Tradeoff:
     candidates = list(family()) if points is None else points
-    question = Question(parse_constraints("budget", budget), [], COMPARE)
-    return weigh(candidates, boards, question, ("No board was used.",))
+    return weigh(candidates, boards, question(budget), ("No board was used.",))
 
 
 def words_of(result: Tradeoff) -> list[str]:
