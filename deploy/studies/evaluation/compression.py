@@ -185,9 +185,8 @@ class Trial:
         ground = self.ground_db[shares, np.arange(len(shares))]
         gain = self.board_db - ground
         source = f"mean of {len(gain)} pairs"
-        figures = {
-            "on board minus on the ground": mean_over_sites(gain, self.sites, seed, "dB", source)
-        }
+        mean_gain = mean_over_sites(gain.tolist(), self.sites, seed, "dB", source)
+        figures = {"on board minus on the ground": mean_gain}
         means = {
             "restored on board": (self.board_db, "dB"),
             "restored on the ground": (ground, "dB"),

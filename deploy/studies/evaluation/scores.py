@@ -31,7 +31,7 @@ Part = Callable[[np.ndarray], np.ndarray]
 
 
 def mean_over_sites(
-    values: Sequence[float] | np.ndarray, sites: Sequence[str], seed: int, unit: str, source: str
+    values: Sequence[float], sites: Sequence[str], seed: int, unit: str, source: str
 ) -> Figure:
     """Average a score over images, with the bootstrap interval over their sites.
 

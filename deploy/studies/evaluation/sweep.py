@@ -302,4 +302,4 @@ class SweepResult:
         the interval is a paired one.
         """
         source = f"mean of {len(values)} pairs"
-        return mean_over_sites(values, self.sites, self.seed, "dB", source)
+        return mean_over_sites(values.tolist(), self.sites, self.seed, "dB", source)

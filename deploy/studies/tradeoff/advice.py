@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from beers_deploy.performance.swath import interval_ends
 from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.figures import Figure, Row
 from beers_deploy.studies.tradeoff.front import (
@@ -16,7 +17,6 @@ from beers_deploy.studies.tradeoff.front import (
     PSNR,
     Comparison,
     Measured,
-    ends,
     figures_to_compare,
     placed,
     significant,
@@ -81,7 +81,7 @@ class Constraint:
         """Return True if the whole interval of a figure complies with the limit, not only its
         value.
         """
-        low, high = ends(figure)
+        low, high = interval_ends(figure)
         return high <= self.limit if self.at_most else low >= self.limit
 
 

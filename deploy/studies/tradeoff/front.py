@@ -16,6 +16,7 @@ import numpy as np
 
 from beers_deploy.model.metrics.bootstrap import site_interval
 from beers_deploy.network import Network
+from beers_deploy.performance.swath import interval_ends
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted
 from beers_deploy.studies.tradeoff.measure import Scores
@@ -170,8 +171,8 @@ def cost_ratio(a: Measured, b: Measured, cost: str) -> Figure:
     source = f"{cost} over that of {b.name}"
     if cost.startswith("host"):
         return measured(value, "x", f"{source}, medians of interleaved runs")
-    a_low, a_high = ends(a.figures[cost])
-    b_low, b_high = ends(b.figures[cost])
+    a_low, a_high = interval_ends(a.figures[cost])
+    b_low, b_high = interval_ends(b.figures[cost])
     interval = (a_low / b_high, a_high / b_low)
     first = a.point
     second = b.point
@@ -184,11 +185,6 @@ def cost_ratio(a: Measured, b: Measured, cost: str) -> Figure:
         elif cost == LATENCY and width is not None and first.board == second.board:
             interval = value * math.exp(-width.low), value * math.exp(width.low)
     return predicted(value, "x", interval, source)
-
-
-def ends(figure: Figure) -> tuple[float, float]:
-    """Return the lower and the upper end of a figure's interval, or its value twice without one."""
-    return figure.interval or (figure.value or 0.0, figure.value or 0.0)
 
 
 def front_rows(front: Sequence[Measured], cost: str, compare: Comparison) -> list[Row]:

@@ -14,6 +14,7 @@ from markupsafe import Markup
 
 from beers_deploy.model.io.files import write_text
 from beers_deploy.model.traditional.baselines import BASELINES
+from beers_deploy.performance.swath import interval_ends
 from beers_deploy.profiles.errors import optional
 from beers_deploy.profiles.figures import Row
 from beers_deploy.report.page import Picture, Report, Section, write_report
@@ -28,7 +29,7 @@ from beers_deploy.report.plots import (
 )
 from beers_deploy.results import Table
 from beers_deploy.studies.tradeoff.advice import Constraint, with_unit
-from beers_deploy.studies.tradeoff.front import BOARDS, FRONT, PSNR, Measured, ends, placed
+from beers_deploy.studies.tradeoff.front import BOARDS, FRONT, PSNR, Measured, placed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -297,7 +298,8 @@ def _draw_front(axes: "Axes", study: Tradeoff) -> None:
     for point, row in zip(study.front, study.front_rows, strict=True):
         x = point.value(study.cost)
         y = point.value(PSNR)
-        axes.plot(ends(point.figures[study.cost]), [y, y], color=LIGHT["line"], lw=2, zorder=0)
+        cost = interval_ends(point.figures[study.cost])
+        axes.plot(cost, [y, y], color=LIGHT["line"], lw=2, zorder=0)
         gain = row.figures.get("PSNR gain")
         if gain is not None and gain.interval is not None:
             before = y - (gain.value or 0.0)
