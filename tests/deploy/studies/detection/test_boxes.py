@@ -62,15 +62,13 @@ def test_pixels_go_where_the_letterbox_takes_their_box(
     # The third band is level, and differs from the grey around the image.
     inside = np.abs(pixels[2] - 0.5) < 1e-3
     rows, columns = np.nonzero(inside)
-    in_input = np.stack([columns, rows, columns + 1, rows + 1], axis=1).astype(float)
-    corners = box.to_image(in_input)
-    assert np.abs(corners.min(0)[:2]).max() < 1e-6
-    assert np.abs(corners.max(0)[2:] - [width, height]).max() < 1e-6
-    centres = (corners[:, :2] + corners[:, 2:]) / 2
+    edges = np.array([[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]])
+    np.testing.assert_allclose(box.to_image(edges), [[0, 0, width, height]], atol=1e-6)
+    middles = box.to_image(np.stack([columns, rows, columns, rows], axis=1) + 0.5)
     # Between the middles of the outermost pixels: at the border it can only repeat the last one.
-    on_scene = np.clip(centres, 0.5, np.array([width, height]) - 0.5)
-    assert np.abs(pixels[0][inside] * width - on_scene[:, 0]).max() < 0.01
-    assert np.abs(pixels[1][inside] * height - on_scene[:, 1]).max() < 0.01
+    x_px, y_px = np.clip(middles[:, :2], 0.5, np.array([width, height]) - 0.5).T
+    assert np.abs(pixels[0][inside] * width - x_px).max() < 0.01
+    assert np.abs(pixels[1][inside] * height - y_px).max() < 0.01
 
 
 def test_an_image_of_which_nothing_would_be_left_is_refused() -> None:
