@@ -19,6 +19,10 @@ from tests.docs.test_commands_in_pages import NAME, context_of
 from tests.docs.walk import ROOT
 
 PAGES = sorted((ROOT / "docs" / "how-to").glob("*.md"))
+TUTORIALS = (ROOT / "docs" / "tutorials").glob("*.md")
+COMMANDS = "".join(page.read_text(encoding="utf-8") for page in TUTORIALS)
+STARTED = set(re.findall(rf"^{NAME} (\w+)", COMMANDS, re.MULTILINE))
+"""Commands that the walks of the tutorials start as a shell starts them."""
 PROGRAMS = {NAME, "python", "python3", "pip", "pytest", "rio", "xdputil"}
 SHELLS = {"console", "bash", "sh"}
 FENCE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)

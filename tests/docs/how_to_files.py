@@ -21,6 +21,7 @@ from beers_deploy.profiles.shipped import HERE as PROFILES
 from tests.deploy.studies.characterize.test_characterize import RATIO, SENSOR, landscape
 from tests.deploy.studies.detection.folders import Object, dior
 from tests.deploy.studies.detection.networks import detector, raw
+from tests.docs.how_to import STARTED
 from tests.docs.walk import ROOT, Walk
 from tests.model.networks import plain
 
@@ -33,7 +34,7 @@ FEW_PX = 480
 MADE = """
 beers-deploy simulate --images scene.png --sensor pleiades-degraded --out made
 beers-deploy export --network narrow.safetensors --out float.onnx
-beers-deploy quantize float.onnx --patches 8 --patch 64 --out int8.onnx --board-file core.onnx
+beers-deploy quantize float.onnx --images aerial --patch 32 --out int8.onnx --board-file core.onnx
 beers-deploy gate float.onnx int8.onnx --patches 4 --json gate-main.json
 """
 
@@ -47,7 +48,7 @@ def prepare(folder: Path) -> None:
     labelled_pictures(folder)
     if find_spec("rasterio"):
         other_formats(folder)
-    walk = Walk(folder)
+    walk = Walk(folder, started=STARTED)
     for command in MADE.split("\n")[1:-1]:
         process = walk.run(command)
         assert process.returncode == 0, f"{command}\n{process.stdout}"

@@ -8,7 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from tests.docs.how_to import LEFT_OUT, PAGES, Sitting, outputs, packages, shortened, sittings
+from tests.docs.how_to import (
+    LEFT_OUT,
+    PAGES,
+    STARTED,
+    Sitting,
+    outputs,
+    packages,
+    shortened,
+    sittings,
+)
 from tests.docs.how_to_files import prepare
 from tests.docs.walk import Walk
 
@@ -37,7 +46,8 @@ def test_it_runs_and_writes_what_it_names(sitting: Sitting, files: Path) -> None
     for package in packages(sitting):
         pytest.importorskip(package, reason=f"no {package}")
     with tempfile.TemporaryDirectory(dir=files.parent) as folder:
-        walk = Walk(Path(shutil.copytree(files, folder, dirs_exist_ok=True)))
+        copy = Path(shutil.copytree(files, folder, dirs_exist_ok=True))
+        walk = Walk(copy, started=STARTED)
         for command in sitting:
             run(walk, command)
 

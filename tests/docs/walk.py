@@ -69,11 +69,13 @@ class Walk:
         folder: where the commands run.
         printed: what each command printed, by the command as the page has it.
         shorter: substitutions in force, each with whether a command had it.
+        started: commands that need not be started as a shell starts them, because one walk did.
     """
 
     folder: Path
     printed: dict[str, str] = field(default_factory=dict)
     shorter: dict[tuple[str, str], bool] = field(default_factory=dict)
+    started: set[str] = field(default_factory=lambda: STARTED)
     _code: int = 0
     _vary: bool = False
     _last: str = ""
@@ -139,9 +141,9 @@ class Walk:
         words = shlex.split(short)
         if not words or words[0] not in PROGRAMS:
             raise PageError(f"{command}\nis no command of {' or '.join(PROGRAMS)}")
-        if words[0] == OURS and STARTED.issuperset(words[1:2]):
+        if words[0] == OURS and self.started.issuperset(words[1:2]):
             return self._within(words[1:])
-        STARTED.update(words[1:2] if words[0] == OURS else ())
+        self.started.update(words[1:2] if words[0] == OURS else ())
         return self._started(words)
 
     def _within(self, words: list[str]) -> Done:
