@@ -31,8 +31,6 @@ from beers_deploy.model.shipped import shipped_names
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.onnx_file import save_onnx
 from benchmarks.small_networks import NETWORKS
-from examples.networks import build
-from examples.networks import to_onnx as example_to_onnx
 from tests.golden.layouts import CREATION, restored
 from tests.golden.small_networks import quantized
 from tests.golden.wrong_calls import CALLS, answer, inputs
@@ -40,7 +38,6 @@ from tests.golden.wrong_calls import CALLS, answer, inputs
 STORED = Path(__file__).resolve().parent / "outputs"
 SHIPPED = "convbeers-xs"
 PLAIN = "plain"
-OTHER = "dncnn"
 PATCHES = ("--patches", "4", "--patch", "48")
 
 
@@ -138,20 +135,16 @@ def _images(folder: Path) -> dict[str, Path]:
 
 
 def _networks(folder: Path) -> dict[str, tuple[str, str]]:
-    """Write the float and the INT8 file of a shipped pair and of two networks of random weights."""
+    """Write the float and the INT8 file of a shipped pair and of a network of random weights."""
     network = ConvBEERS(Variant(blocks=2, features=8))
     initialise(network, torch.Generator().manual_seed(0))
     save_onnx(to_onnx(network, {}), folder / f"{PLAIN}.onnx")
-    save_onnx(
-        example_to_onnx(OTHER, build(OTHER, torch.Generator().manual_seed(0))),
-        folder / f"{OTHER}.onnx",
-    )
     files = {SHIPPED: (str(folder / "xs.onnx"), str(folder / "xs-int8.onnx"))}
     for name, path in ((SHIPPED, "xs.onnx"), (f"{SHIPPED}-int8", "xs-int8.onnx")):
         _run("export", "--network", name, "--out", folder / path)
-    for name in (PLAIN, OTHER):
-        _run("quantize", folder / f"{name}.onnx", "--out", folder / f"{name}-int8.onnx", *PATCHES)
-        files[name] = (str(folder / f"{name}.onnx"), str(folder / f"{name}-int8.onnx"))
+    floating, int8 = (str(folder / f"{PLAIN}{suffix}") for suffix in (".onnx", "-int8.onnx"))
+    _run("quantize", floating, "--out", int8, *PATCHES)
+    files[PLAIN] = (floating, int8)
     return files
 
 
