@@ -190,14 +190,10 @@ def test_a_pair_in_memory_is_evaluated_as_one_of_files(pair: bd.Pair, tmp_path: 
     from_files = bd.evaluate(
         methods=["convbeers-half-xs"], pairs=pair.save(tmp_path / "pairs"), progress=False
     )
-    ways: dict[str, Any] = {
-        "network": "convbeers-half-xs",
-        "half": lambda dn: dn / 2,
-        "mine": Tiny(),
-    }
+    ways: dict[str, Any] = {"network": "convbeers-half-xs", "half": lambda dn: dn / 2}
     in_memory = bd.evaluate(methods=ways, pairs=[pair], progress=False)
     names = {row.name: row.figures for row in in_memory.rows if row.table == "mean"}
-    assert set(names) >= {"degraded", "network", "half", "mine"}
+    assert set(names) >= {"degraded", "network", "half"}
     assert names["network"]["PSNR"].value == next(
         row.figures["PSNR"].value for row in from_files.rows if row.name == "convbeers-half-xs"
     )
@@ -263,10 +259,6 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
     "no such sensor": (lambda raw: bd.restore(raw, sensor="none"), "'none'.*dior-high"),
     "no such network": (lambda raw: bd.restore(raw, network="none"), "a shipped network"),
     "no network": (lambda _: bd.Network.load(3), r"torch.nn.Module"),  # type: ignore[arg-type]
-    "a tile of no use": (
-        lambda raw: bd.restore(raw, tile=64, method="traditional"),
-        "`tile` has no effect with `method` traditional",
-    ),
     "a COG of an array": (
         lambda raw: bd.restore(raw, cog=True),
         "`cog` has no effect with an array",
@@ -295,10 +287,6 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
         "INT8 network of Tiny is missing.*`int8_network`",
     ),
     "no shipped pair": (lambda _: bd.gate("convbeers-m"), "no shipped weights 'convbeers-m'"),
-    "images and samples": (
-        lambda raw: bd.gate(SMALL, samples=raw[None, None] / 4095, images="scenes"),
-        "`images` has no effect with `samples`",
-    ),
     "no board": (lambda _: bd.bench(SMALL, target="none"), "'none'.*vck190"),
     "no pairs": (
         lambda raw: bd.quantize(Tiny(), samples=(raw[None, None], raw[None, None].repeat(2, 0))),

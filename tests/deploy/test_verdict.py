@@ -76,11 +76,10 @@ def test_a_document_that_is_no_baseline_is_refused(
         read_baseline(written(tmp_path / "b.json", content), ASKED)
 
 
-@pytest.mark.parametrize("key", ["verdict"])
-def test_a_key_that_stands_twice_is_refused(key: str, tmp_path: Path) -> None:
+def test_a_key_that_stands_twice_is_refused(tmp_path: Path) -> None:
     text = json.dumps(document())
-    (tmp_path / "b.json").write_text(text.replace(f'"{key}":', f'"{key}": 0, "{key}":'))
-    with pytest.raises(OptionError, match=f"key '{key}' twice"):
+    (tmp_path / "b.json").write_text(text.replace('"verdict":', '"verdict": 0, "verdict":'))
+    with pytest.raises(OptionError, match="key 'verdict' twice"):
         read_baseline(tmp_path / "b.json", ASKED)
 
 

@@ -39,6 +39,3 @@ def test_an_array_has_the_pixels_of_the_integer_reference(name: str) -> None:
         np.testing.assert_array_equal(
             restore(dn, network=model, tile=tile_px, threads=threads), expected
         )
-
-
-"""The network alone, as the reference computes it."""

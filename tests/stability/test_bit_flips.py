@@ -152,11 +152,6 @@ def test_the_command(pair: list[Path], tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         (["FLOAT", "--bit-flips"], "INT8 network"),
-        (
-            ["FLOAT", "INT8", "--bit-flips", "--cases", "snow"],
-            "--cases has no effect with --bit-flips",
-        ),
-        (["FLOAT", "INT8", "--draws", "5"], "--draws has no effect without --bit-flips"),
         (["FLOAT", "INT8", "--bit-flips", "--sensor", "nobody"], "nobody"),
         (["FLOAT", "INT8", "--bit-flips", "--target", "nobody"], "nobody"),
         (["FLOAT", "INT8", "--bit-flips", "--images", "nowhere"], "nowhere"),

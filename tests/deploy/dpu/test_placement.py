@@ -45,17 +45,6 @@ def test_the_core_of_each_encoding_is_one_subgraph_between_host_parts(
     assert "subgraphs" not in remarks
 
 
-def test_an_operator_in_the_middle_cuts_the_core_in_two(tmp_path: Path) -> None:
-    sketch = Sketch(8)
-    middle = sketch.node("Sigmoid", sketch.conv("image"))
-    placement = placed(sketch.save(tmp_path / "s.onnx", sketch.conv(middle)))
-    assert placement.dpu_subgraphs == 2
-    assert remarks_on(placement, DPU, 21)["subgraphs"].startswith("2 DPU subgraphs")
-    assert [node.device for node in placement.nodes] == ["DPU", "CPU", "DPU"]
-    assert len(placement.cuts) == 4
-    assert {cut.size_bytes for cut in placement.cuts} == {8 * 21 * 21}
-
-
 def test_a_branch_past_the_cpu_does_not_join_what_it_parts(tmp_path: Path) -> None:
     """The skip ends in the second piece: were the two one, it would wait for itself."""
     sketch = Sketch(8)
