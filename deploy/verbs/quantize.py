@@ -3,6 +3,7 @@
 import logging
 import os
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -25,7 +26,14 @@ from beers_deploy.verbs.parameters import (
     Steps,
     TargetLike,
 )
-from beers_deploy.verbs.verb import path_or_none, recorded, refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import (
+    changed,
+    path_or_none,
+    recorded,
+    refuse_with,
+    refuse_without,
+    verb,
+)
 
 if TYPE_CHECKING:
     from beers_deploy.network import Network
@@ -38,9 +46,6 @@ logger = logging.getLogger(__name__)
 PAGES = ("report.html", "report.json", "node-data.json")
 """What --report writes into its folder."""
 
-PATCHES = 64
-PATCH_PX = 128
-
 
 @verb
 def quantize(
@@ -52,8 +57,8 @@ def quantize(
     samples: Samples | None = None,
     input_range: InputRange | None = None,
     images: InputPath | None = None,
-    patches: Annotated[int, Interval(ge=1, le=100_000)] = PATCHES,
-    patch: Annotated[int, Interval(ge=32, le=2048)] = PATCH_PX,
+    patches: Annotated[int, Interval(ge=1, le=100_000)] = 64,
+    patch: Annotated[int, Interval(ge=32, le=2048)] = 128,
     effort: Literal["fast", "normal", "best"] = "normal",
     finetune: Steps = 0,
     adapt: bool = False,
@@ -119,6 +124,8 @@ def quantize(
         >>> bd.quantize(network, samples=samples, target="zcu102").precision
         'int8'
     """
+    options = partial(changed, quantize, locals())
+
     from beers_deploy.comparison import Data
     from beers_deploy.kit.board_file import require_core_file, save_core
     from beers_deploy.profiles.sensor import Sensor
@@ -130,17 +137,11 @@ def quantize(
     from beers_deploy.results import Table
 
     if board_file is None:
-        refuse_without("`board_file`", tile=tile is not None)
+        refuse_without("`board_file`", **options("tile"))
     if samples is None:
-        refuse_without("`samples`", input_range=input_range is not None)
+        refuse_without("`samples`", **options("input_range"))
     else:
-        refuse_with(
-            "`samples`",
-            images=images is not None,
-            patches=patches != PATCHES,
-            patch=patch != PATCH_PX,
-            seed=seed != 0,
-        )
+        refuse_with("`samples`", **options("images", "patches", "patch", "seed"))
     board = TargetProfile.load(target)
     files = [path_or_none(path) for path in (out, board_file)]
     inputs = [Path(each) for each in (network, samples) if isinstance(each, str | os.PathLike)]
