@@ -55,10 +55,9 @@ gate f.onnx i.onnx --images scenes --patches 2 --json gate.json
 check i.onnx --tile 64
 bench i.onnx --size 300x200 --tile 64 --no-traditional
 restore raw.tif out.tif --network i.onnx
-gate f.onnx i.onnx --images scenes --patches 2 --baseline gate.json
 evaluate --images scenes --methods degraded,i.onnx
 simulate --scene haze-over-sea --explain
-simulate --patch 32 --workers 1 --out pairs
+simulate --patch 256 --workers 1 --out pairs
 train --variant convbeers-xs --drawn 1 --steps 2 --batch 1 --patch 32 --validate-every 0 --lpips-weight 0 --out run
 """  # noqa: E501 - commands, one a line
 
