@@ -41,6 +41,30 @@ def test_the_quantile_of_single_scores_is_that_of_split_conformal_prediction(
     assert conformal_quantile(scores, level) == wanted
 
 
+@pytest.mark.parametrize("level", [50, 80, 90])
+def test_the_quantile_is_that_of_puncc(level: int) -> None:
+    """DEEL's puncc gets the scores, the weights, and one infinite score for the group to come."""
+    calibration = pytest.importorskip(
+        "deel.puncc.api.calibration",
+        reason="puncc is not installed: it needs NumPy below 2, pandas and scikit-learn",
+    )
+    calibrator = calibration.BaseCalibrator(
+        nonconf_score_func=lambda predicted, true: np.abs(predicted - true),
+        pred_set_func=lambda predicted, scores_quantile: (predicted, scores_quantile),
+    )
+    # No sum of weights equals a level: puncc's float sums may fall on either side of a tie.
+    for scores in (random_scores(36), [*random_scores(20, 7), *random_scores(12, 3, seed=1)]):
+        values = np.concatenate(scores)
+        calibrator.fit(y_true=values, y_pred=np.zeros_like(values))
+        shares = [np.full(group.size, 1 / group.size) for group in scores]
+        weights = np.concatenate([*shares, np.ones(1)]) / (len(scores) + 1)
+        theirs = calibrator.compute_quantile(alpha=1 - level / 100, weights=weights)
+        assert conformal_quantile(scores, level) == pytest.approx(float(theirs), rel=1e-12)
+        if len(values) == len(scores):
+            plain = calibrator.compute_quantile(alpha=1 - level / 100)
+            assert conformal_quantile(scores, level) == pytest.approx(float(plain), rel=1e-12)
+
+
 def test_a_new_group_is_covered_as_often_as_the_level_says() -> None:
     """Over many calibrations the mean coverage of one more group is the level or a little more."""
     covered = []
