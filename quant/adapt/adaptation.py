@@ -21,7 +21,6 @@ from beers_deploy.quant.adapt.replacements import (
     APPROXIMATIONS,
     EXACT,
     Kind,
-    hard_swish_behind_convolutions,
     nodes_by_kind,
     replaced,
 )
@@ -31,6 +30,7 @@ from beers_deploy.quant.onnx.graph import OnnxGraph
 from beers_deploy.quant.onnx.image_input import fixed_tile_px
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_any_size
+from beers_deploy.quant.simplify.activations_first import behind_convolutions
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 
 ADAPTED = "adapted"
@@ -150,7 +150,7 @@ def adapt(model: onnx.ModelProto, samples: Patches, held_out: Patches) -> Adapte
         rows.append(Row(ADAPTED, f"{count} {kind}", figures, {"becomes": becomes}))
     record = "; ".join(f"{row.name}: {row.text['becomes']}" for row in rows)
     rows.append(Row(ADAPTED, "all", chosen.figures))
-    return Adapted(hard_swish_behind_convolutions(chosen.model), tuple(rows), record)
+    return Adapted(behind_convolutions(chosen.model), tuple(rows), record)
 
 
 def _trial(

@@ -18,9 +18,6 @@ And by another function again:
 6. Spatial attention that shrinks and enlarges by no whole factors is aligned with its map
    (`quant.graph.attention`).
 
-A DPU computes HardSwish behind convolutions alone. Elsewhere, such as behind a sum, it gets a
-convolution of one pixel in front of it that changes nothing.
-
 Mish, Tanh, ELU and Softplus stay: no function of the DPU is near enough to be fitted.
 """
 
@@ -42,7 +39,7 @@ from beers_deploy.quant.simplify.fold_affine import (
     per_channel,
 )
 from beers_deploy.quant.simplify.spelled_activations import gelu_gate_input, other_operand
-from beers_deploy.quant.simplify.standard_operators import channels_in, float_shapes
+from beers_deploy.quant.simplify.standard_operators import float_shapes
 
 
 class Kind(StrEnum):
@@ -215,36 +212,6 @@ def replaced(
     fold_in_front(graph, float_shapes(graph))
     graph.save()
     return activations_first(network)
-
-
-def hard_swish_behind_convolutions(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Return a network of the same function in which each HardSwish reads a convolution.
-
-    Args:
-        model: a simplified float network; not changed.
-    """
-    network = deepcopy(model)
-    graph = OnnxGraph(network)
-    shapes = float_shapes(graph)
-
-    def with_copy(graph: OnnxGraph, node: Node) -> list[Node] | None:
-        writer = graph.writers.get(node.inputs[0]) if node.op_type == "HardSwish" else None
-        if writer is None or is_convolution(graph, writer):
-            return None
-        (source,) = node.inputs
-        channels = channels_in(shapes, source)
-        if not channels:
-            return None
-        copy = f"{node.outputs[0]}.copy"
-        ones = np.ones((channels, 1, 1, 1))
-        return [
-            graph.convolution(source, copy, copy, ones, group=channels),
-            Node.new(node.op_type, [copy], node.outputs[0], node.name),
-        ]
-
-    graph.rewrite(with_copy)
-    graph.save()
-    return network
 
 
 def _approximation(graph: OnnxGraph, node: Node, kind: Kind) -> Node:

@@ -66,13 +66,6 @@ def _read_conv(node: Node, graph: OnnxGraph) -> Op:
     """Read a convolution of one group, or of one for each channel."""
     weight, bias = _weights(node, graph)
     groups = int(node.attributes.get("group", 1))
-    if groups > 1 and weight.shape[1] == 1 and len(weight) > groups:
-        # A depthwise convolution of several results a channel is exactly a dense one with zeros.
-        results = np.arange(len(weight))
-        dense = np.zeros((len(weight), groups, *weight.shape[2:]), np.float32)
-        dense[results, results // (len(weight) // groups)] = weight[:, 0]
-        weight = dense
-        groups = 1
     # A DPU has one group or one a channel: its tools leave others to the processor.
     depthwise = groups == len(weight) and weight.shape[1] == 1
     require(
@@ -90,9 +83,6 @@ def _read_transposed_conv(node: Node, graph: OnnxGraph) -> Op:
     """Read a transposed convolution that enlarges rows and columns by the same factor."""
     weight, bias = _weights(node, graph)
     attribute = node.attributes.get
-    groups = attribute("group", 1)
-    rule = f"must have one group, got {groups}"
-    require(groups == 1, node, rule, "Use one group, with zeros where groups do not meet.")
     strides = list(attribute("strides", [1, 1]))
     rule = f"must have one stride for rows and columns, got strides {strides}"
     require(len(set(strides)) == 1, node, rule, "Use a square stride.")
@@ -102,11 +92,8 @@ def _read_transposed_conv(node: Node, graph: OnnxGraph) -> Op:
         set(dilations) == {1}, node, rule, "Use a larger kernel, with zeros between its values."
     )
     padding = list(node.output_padding)
-    # AMD's tools leave a transposed convolution with output padding to the processor.
-    rule = f"must have no output padding, got {padding}"
-    require(
-        not any(padding), node, rule, "Use an even kernel, such as 4 x 4 with stride 2, pads 1."
-    )
+    # Simplification has made it a part of the kernel where pads are stated.
+    require(not any(padding), node, f"must have no output padding, got {padding}")
     for name in ("output_shape", "auto_pad"):
         value = attribute(name, "NOTSET")
         rule = f"must have pads instead of {name} {value}"

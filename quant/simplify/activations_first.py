@@ -1,26 +1,40 @@
-"""Move activations in front of operations that only move values, into the convolution before.
+"""Let activations and pixel shuffles follow convolutions.
 
 A DPU computes an activation in one pass with a convolution, and not behind a pixel shuffle, a
-concat, a pooling or an enlargement.
+concat, a pooling or an enlargement. It shuffles the results of convolutions alone.
 
 1. An activation is computed for each value alone, so that it may as well precede a pixel shuffle, a
    concat or an enlargement that repeats pixels.
 2. A rising activation may also precede a maximum.
 3. It is moved only where it reaches convolutions that nothing else reads, and through several such
    operations one after the other.
+4. Anywhere else a convolution of one pixel that changes nothing is put in front. It takes in the
+   arithmetic with constants that it reads.
 
 All of it is exact.
 """
 
 from copy import deepcopy
 
+import numpy as np
 import onnx
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.simplify.fold_affine import fold_in_front
+from beers_deploy.quant.simplify.standard_operators import channels_in, float_shapes
 
 RISING = {"Clip", "LeakyRelu", "Relu"}
 ACTIVATIONS = RISING | {"HardSwish"}
 CONVOLUTIONS = {"Conv", "ConvTranspose"}
+MAY_FOLLOW = {
+    "Clip": CONVOLUTIONS,
+    "DepthToSpace": CONVOLUTIONS | ACTIVATIONS,
+    "HardSwish": CONVOLUTIONS,
+    "Relu": CONVOLUTIONS | {"Add"},
+}
+"""The operators that a DPU computes one of these behind."""
+HOST = {"Add", "Clip", "DepthToSpace"}
+"""Operators that may follow a pixel shuffle that the host computes."""
 
 
 def activations_first(model: onnx.ModelProto) -> onnx.ModelProto:
@@ -41,6 +55,53 @@ def activations_first(model: onnx.ModelProto) -> onnx.ModelProto:
         graph.rewrite(move_in_front)
         graph.save()
     return network
+
+
+def behind_convolutions(model: onnx.ModelProto) -> onnx.ModelProto:
+    """Put convolutions that change nothing in front of activations and pixel shuffles that follow
+    no convolution (point 4 of the module).
+
+    Args:
+        model: the network.
+
+    Returns:
+        A network of the same function; `model` itself if nothing is missing.
+    """
+    network = deepcopy(model)
+    graph = OnnxGraph(network)
+    if not any(_lacks_convolution(graph, node) for node in graph.nodes):
+        return model
+    shapes = float_shapes(graph)
+
+    def with_copy(graph: OnnxGraph, node: Node) -> list[Node] | None:
+        source = node.inputs[0] if node.inputs else ""
+        channels = channels_in(shapes, source)
+        if not channels or not _lacks_convolution(graph, node):
+            return None
+        copy = f"{node.outputs[0]}.copy"
+        ones = np.ones((channels, 1, 1, 1))
+        inputs = [copy, *node.inputs[1:]]
+        return [
+            graph.convolution(source, copy, copy, ones, group=channels),
+            Node.new(node.op_type, inputs, node.outputs[0], node.name, **node.attributes),
+        ]
+
+    graph.rewrite(with_copy)
+    fold_in_front(graph, shapes)
+    graph.save()
+    return network
+
+
+def _lacks_convolution(graph: OnnxGraph, node: Node) -> bool:
+    """Return True for an activation or an inner pixel shuffle that no convolution precedes."""
+    before = graph.writers.get(node.inputs[0]) if node.op_type in MAY_FOLLOW else None
+    if before is None or node.outputs[0] in graph.outputs:
+        return False
+    readers = {reader.op_type for reader in graph.readers[node.outputs[0]]}
+    if node.op_type == "DepthToSpace" and readers <= HOST:
+        return False
+    is_sum = before.op_type != "Add" or graph.constants.keys().isdisjoint(before.inputs)
+    return before.op_type not in MAY_FOLLOW[node.op_type] or not is_sum
 
 
 def _any_moves(graph: OnnxGraph) -> bool:

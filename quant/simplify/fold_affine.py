@@ -1,12 +1,12 @@
 """Fold operations that scale and shift each channel into the convolutions next to them.
 
-1. A Sub of a convolution's result becomes an Add: the convolution is negated. A Sub of any other
-   map of known channels becomes one too: a convolution of one pixel negates the map.
-2. A BatchNormalization, or arithmetic with one constant per channel, is folded into the convolution
-   that it follows, if nothing else reads that convolution's result.
+1. A Sub of two maps becomes a product by -1 and an Add.
+2. A BatchNormalization, a Neg, or arithmetic with one constant per channel, is folded into the
+   convolution that it follows, if nothing else reads that convolution's result.
 3. Operations in front of convolutions are folded into all of them, if that is exact: the zeros that
    a convolution pads with are not shifted.
-4. A remaining BatchNormalization of images becomes a depthwise convolution of one pixel.
+4. A remaining BatchNormalization, Div or Neg of maps becomes a depthwise convolution of one pixel,
+   and arithmetic of one channel with several constants one that writes several channels.
 
 All of it is exact except for the rounding of float32, borders included.
 """
@@ -19,6 +19,9 @@ from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.standard_operators import Shapes, channels_in
 
 NORMALISATION = "BatchNormalization"
+LACKING = {NORMALISATION, "Div", "Neg"}
+"""Operators that a DPU does not compute."""
+PARTS = {"Erf", "Sigmoid"}
 
 
 @dataclass(frozen=True)
@@ -39,29 +42,8 @@ class Affine:
         return max(len(self.scale), len(self.shift))
 
 
-def add_negated(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a - b by a + (-b), where the convolution that computes b is negated (point 1 of the
-    module).
-
-    Args:
-        graph: the graph that the node belongs to; the convolution gets other weights.
-        node: any node.
-
-    Returns:
-        The Add; None if the node is no Sub of a convolution's result that nothing else reads.
-    """
-    if node.op_type != "Sub" or node.inputs[0] in graph.constants:
-        return None
-    before = graph.sole_writer(node.inputs[1])
-    if before is None or not is_convolution(graph, before):
-        return None
-    _fold(graph, before, Affine(np.full(1, -1.0), np.zeros(1)), into_results=True)
-    return [Node.new("Add", node.inputs, node.outputs[0], node.proto.name)]
-
-
-def negate_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a - b by a + (-b), where a new convolution of one pixel negates b (point 1 of the
-    module).
+def add_negated(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace a - b by a + (-b), so that the factor -1 can be folded (point 1 of the module).
 
     Args:
         shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
@@ -69,38 +51,18 @@ def negate_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[
         node: any node.
 
     Returns:
-        The convolution and the Add; None if the node is no Sub of two maps of known channels.
+        The product by -1 and the Add; None if the node is no Sub of two float maps.
     """
-    channels = channels_in(shapes, node.inputs[1]) if node.op_type == "Sub" else 0
-    if not channels or not graph.constants.keys().isdisjoint(node.inputs):
+    is_of_maps = graph.constants.keys().isdisjoint(node.inputs)
+    if node.op_type != "Sub" or not is_of_maps or node.inputs[1] not in shapes:
         return None
-    name = f"{node.outputs[0]}.negated"
-    weight = np.full((channels, 1, 1, 1), -1.0)
-    negation = graph.convolution(node.inputs[1], name, name, weight, group=channels)
-    return [negation, Node.new("Add", [node.inputs[0], name], node.outputs[0], node.proto.name)]
-
-
-def divide_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a division by constants, which a DPU does not compute, by a convolution of one pixel.
-
-    Args:
-        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
-        graph: the graph that the node belongs to; its constants are extended.
-        node: any node.
-
-    Returns:
-        The convolution; None if the node is no Div of a map of known channels by numbers for each
-        channel, none of which is 0, or is a part of a GELU or Swish.
-    """
-    divisor = per_channel(graph.value(node, 1)) if node.op_type == "Div" else None
-    channels = 0 if divisor is None else channels_in(shapes, node.inputs[0])
-    if divisor is None or not channels or not divisor.all():
-        return None
-    # A GELU or Swish is recognised by its parts.
-    if any(reader.op_type in ("Erf", "Sigmoid") for reader in graph.readers[node.outputs[0]]):
-        return None
-    weight = np.broadcast_to(1 / divisor, channels).reshape(channels, 1, 1, 1)
-    return [graph.convolution(node.inputs[0], node.outputs[0], node.name, weight, group=channels)]
+    result = node.outputs[0]
+    name = f"{result}.negated"
+    factor = graph.add_constant(f"{name}.factor", np.array(-1))
+    return [
+        Node.new("Mul", [node.inputs[1], factor], name, name),
+        Node.new("Add", [node.inputs[0], name], result, node.proto.name),
+    ]
 
 
 def fold_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
@@ -159,9 +121,9 @@ def fold_in_front(graph: OnnxGraph, shapes: Shapes) -> None:
     graph.set_nodes([node for node in graph.nodes if node not in folded])
 
 
-def convolve_normalisation(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a BatchNormalization that could not be folded by a depthwise convolution (point 4 of
-    the module).
+def convolve_affine(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace what scales and shifts channels, could not be folded, and is more than a DPU's
+    product or sum, by a convolution of one pixel (point 4 of the module).
 
     Args:
         shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
@@ -172,23 +134,29 @@ def convolve_normalisation(shapes: Shapes, graph: OnnxGraph, node: Node) -> list
         The convolution, or an empty list if the node can now be folded into the convolution in
         front of it. None if the node stays.
     """
-    # The normalisation in front may just have become a convolution, which takes this one in.
+    # What stands in front may just have become a convolution, which takes this one in.
     replacement = fold_behind(graph, node)
-    match = affine_of(graph, node) if node.op_type == NORMALISATION else None
-    if replacement is not None or match is None or len(shapes.get(node.inputs[0], ())) != 4:
+    match = affine_of(graph, node)
+    channels = channels_in(shapes, match[0]) if match is not None else 0
+    if replacement is not None or match is None or not channels:
         return replacement
     source, affine = match
-    weight = affine.scale.reshape(-1, 1, 1, 1)
-    result = node.outputs[0]
-    group = affine.channels
-    return [graph.convolution(source, result, node.name, weight, affine.shift, group=group)]
+    width = max(channels, affine.channels)
+    # A GELU or Swish is recognised by its parts.
+    is_part = any(reader.op_type in PARTS for reader in graph.readers[node.outputs[0]])
+    is_lacking = node.op_type in LACKING and not (is_part and node.op_type == "Div")
+    if channels not in (1, width) or not (is_lacking or width > channels):
+        return None
+    weight, shift = (np.broadcast_to(values, width) for values in (affine.scale, affine.shift))
+    weight = weight.reshape(-1, 1, 1, 1)
+    return [graph.convolution(source, node.outputs[0], node.name, weight, shift, group=channels)]
 
 
 def affine_of(graph: OnnxGraph, node: Node) -> tuple[str, Affine] | None:
     """Return the scale and shift of a node that multiplies channels by constants, and adds
     constants.
 
-    That is a BatchNormalization, or an Add, Sub, Mul or Div by one constant per channel.
+    That is a BatchNormalization, a Neg, or an Add, Sub, Mul or Div by one constant per channel.
 
     Args:
         graph: the graph that the node belongs to.
@@ -200,6 +168,8 @@ def affine_of(graph: OnnxGraph, node: Node) -> tuple[str, Affine] | None:
     """
     if node.op_type == NORMALISATION:
         return _normalisation(graph, node)
+    if node.op_type == "Neg":
+        return node.inputs[0], Affine(-np.ones(1), np.zeros(1))
     if node.op_type not in ("Add", "Div", "Mul", "Sub"):
         return None
     for place in (0, 1):

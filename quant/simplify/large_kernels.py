@@ -21,16 +21,6 @@ LARGE_POSITIONS = 64
 """Height times width, 8 x 8, up to which a kernel is not split, because some targets compute it."""
 
 
-def is_large(shape: tuple[int, ...]) -> bool:
-    """Return True if a kernel has more than LARGE_POSITIONS positions, height times width, and is
-    split.
-
-    Args:
-        shape: (O, I, kh, kw) the sizes of the weights.
-    """
-    return len(shape) == 4 and shape[2] * shape[3] > LARGE_POSITIONS
-
-
 def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a convolution of a large kernel by several of smaller ones, and the sum of their
     results.
@@ -49,7 +39,8 @@ def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
     outputs, _, rows, columns = weight.shape
     states_pads = node.attributes.get("auto_pad", "NOTSET") == "NOTSET"
     one_group = node.attributes.get("group", 1) == 1
-    if not (is_large(weight.shape) and states_pads and one_group and columns <= MOST_POSITIONS):
+    is_large = rows * columns > LARGE_POSITIONS
+    if not (is_large and states_pads and one_group and columns <= MOST_POSITIONS):
         return None
     # A part may have MOST_POSITIONS // columns rows, so this is the least number of parts.
     step = -(-rows // (MOST_POSITIONS // columns))

@@ -46,21 +46,23 @@ from onnx.shape_inference import InferenceError
 from beers_deploy.profiles.errors import ModelError, reason_of
 from beers_deploy.quant.domains import IR_VERSION, OPSET, opset_of
 from beers_deploy.quant.onnx.graph import OnnxGraph, free_name
-from beers_deploy.quant.simplify.activations_first import activations_first
+from beers_deploy.quant.simplify.activations_first import (
+    activations_first,
+    behind_convolutions,
+)
 from beers_deploy.quant.simplify.channels_first import channels_first
 from beers_deploy.quant.simplify.crop_borders import convolve_crop
 from beers_deploy.quant.simplify.fold_affine import (
     add_negated,
-    convolve_normalisation,
-    divide_by_convolution,
+    convolve_affine,
     fold_behind,
     fold_in_front,
-    negate_by_convolution,
 )
 from beers_deploy.quant.simplify.free_sizes import free_sizes
 from beers_deploy.quant.simplify.fully_connected import ConnectByConvolutions
+from beers_deploy.quant.simplify.grouped_convolutions import without_groups
 from beers_deploy.quant.simplify.image_residual import add_to_image, clip_last
-from beers_deploy.quant.simplify.large_kernels import is_large, split_large_kernel
+from beers_deploy.quant.simplify.large_kernels import split_large_kernel
 from beers_deploy.quant.simplify.missing_border import with_missing_border
 from beers_deploy.quant.simplify.repeat_channels import broadcasts_channels, repeat_channels
 from beers_deploy.quant.simplify.spelled_activations import (
@@ -119,7 +121,7 @@ def simplify(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     """
     with contradictions(where):
         network = model if _is_plain(model) else _simplified(model, where)
-        return with_missing_border(activations_first(network))
+        return with_missing_border(behind_convolutions(activations_first(network)))
 
 
 def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
@@ -156,9 +158,10 @@ def _run_passes(model: onnx.ModelProto) -> None:
         join_relu,
         join_hard_swish,
         halve_before_gelu,
-        add_negated,
+        partial(add_negated, float_shapes(graph)),
         add_to_image,
         fold_behind,
+        without_groups,
         split_large_kernel,
     ):
         graph.rewrite(rewriting)
@@ -169,9 +172,7 @@ def _run_passes(model: onnx.ModelProto) -> None:
         repeat_channels,
         drop_cast,
         pool_mean,
-        convolve_normalisation,
-        negate_by_convolution,
-        divide_by_convolution,
+        convolve_affine,
         unshuffle_slices,
         split_channels,
         convolve_crop,
@@ -188,10 +189,7 @@ def _is_plain(model: onnx.ModelProto) -> bool:
     weights = {tensor.name for tensor in model.graph.initializer}
     is_of_plain_operators = (
         opset_of(model) == OPSET
-        and not any(
-            tensor.data_type in OTHER_FLOATS or is_large(tuple(tensor.dims))
-            for tensor in model.graph.initializer
-        )
+        and not any(tensor.data_type in OTHER_FLOATS for tensor in model.graph.initializer)
         and not any(value.name in weights for value in model.graph.input)
         and all(
             node.op_type in PLAIN
@@ -200,7 +198,15 @@ def _is_plain(model: onnx.ModelProto) -> bool:
             for node in model.graph.node
         )
     )
-    return is_of_plain_operators and not broadcasts_channels(model)
+    if not is_of_plain_operators:
+        return False
+    graph = OnnxGraph(model)
+    rewritten = (
+        rewriting(graph, node)
+        for rewriting in (without_groups, split_large_kernel)
+        for node in graph.nodes
+    )
+    return all(nodes is None for nodes in rewritten) and not broadcasts_channels(model)
 
 
 def _to_float32(model: onnx.ModelProto) -> None:

@@ -198,15 +198,6 @@ VALID = {
         point=(4, 5, 1, 1),
         out=(1, 4, 3, 3),
     ),
-    "depthwise of two results a channel": sketch(
-        f"""first = {SAME}(in, first_w, first_b)
-        inner = Conv<pads=[1,1,1,1], group=3>(first, inner_w, inner_b)
-        r = Relu(inner)
-        out = {SAME}(r, out_w, out_b)""",
-        first=(3, 1, 3, 3),
-        inner=(6, 1, 3, 3),
-        out=(1, 6, 3, 3),
-    ),
     "many classes": sketch(
         "out = Conv<strides=[3,3]>(in, out_w, out_b)",
         1200,

@@ -2,7 +2,10 @@
 its remedy.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -110,10 +113,25 @@ WIDE = {
     "elementwise channels",
     "shuffle channels",
 }
+REWRITTEN = {
+    "activation of sums",
+    "activation place",
+    "conv groups",
+    "shuffle place",
+    "transposed output padding",
+}
+"""Rules that simplified float files keep, and those of other quantisers may break."""
 OTHERS = {"conv area", "int8 operator", "int8 alone", "bias width"}
 """Rules of other boards: tests/deploy/dpu/test_boards.py, test_npu.py."""
 SIZES = {"map exists", "maps aligned", "map in memory"}
 NUMBERS = {case.split(":")[0] for case in NUMBER_CASES} | {"int32 bias", "on integers"}
+
+
+@contextmanager
+def as_written() -> Iterator[None]:
+    """Read files without simplifying them."""
+    with patch("beers_deploy.quant.onnx_file.simplify", lambda model, _: model):
+        yield
 
 
 def test_every_rule_has_a_case() -> None:
@@ -134,7 +152,8 @@ def test_each_rule_refuses_its_case_alone_and_following_the_remedy_passes(
     With the remedy followed it passes, so a user who obeys the message gets on.
     """
     breaks, follows = CASES[rule]
-    assert between_convs(tmp_path, breaks) == [rule]
+    with as_written() if rule in REWRITTEN else nullcontext():
+        assert between_convs(tmp_path, breaks) == [rule]
     assert between_convs(tmp_path, follows) == []
 
 
@@ -229,7 +248,8 @@ def test_a_tile_that_the_memory_cannot_hold(tmp_path: Path) -> None:
 def test_all_broken_rules_of_a_node_are_listed(tmp_path: Path) -> None:
     """All faults of a node are reported at once, so that a user does not find them one by one."""
     draw = conv(8, 4, 17, 9, group=2, strides=[9, 1], pads=[0, 0, 20, 0])
-    rules = between_convs(tmp_path, draw)
+    with as_written():
+        rules = between_convs(tmp_path, draw)
     assert rules == ["conv kernel", "conv stride", "conv padding", "conv window", "conv groups"]
 
 

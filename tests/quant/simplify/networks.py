@@ -17,6 +17,8 @@ WEIGHTS: dict[str, tuple[int, ...]] = {
     "w": (4, 4, 3, 3),
     "up": (4, 2, 2, 2),
     "deep": (4, 1, 3, 3),
+    "halves": (6, 2, 3, 3),
+    "twins": (8, 1, 1, 1),
     "one": (1, 4, 3, 3),
     "b": (4,),
     "image": (4, 1, 1),
@@ -138,10 +140,29 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
     ),
     "one channel times four constants": (
         f"c = {SAME}(x, one) m = Mul(c, image) y = {SAME}(m, w)",
-        {"Conv": 2, "Mul": 1},
+        {"Conv": 3},
+    ),
+    "the negative of a map": (
+        f"{CONV} n = Neg(x) m = Neg(c) a = Add(n, m) y = Mul(a, x)",
+        {"Conv": 2, "Add": 1, "Mul": 1},
+    ),
+    "ReLU of the image as it is scaled": (
+        f"m = Mul(x, six) n = Sub(m, half) r = Relu(n) y = {SAME}(r, w)",
+        {"Conv": 2, "Relu": 1},
+    ),
+    "activations behind sums and products": (
+        """c = Clip(x, zero, six) a = Add(c, x) k = Clip(a, zero, six) d = Mul(k, x) e = Relu(d)
+        y = Add(e, x)""",
+        {"Clip": 2, "Add": 2, "Mul": 1, "Relu": 1, "Conv": 2},
+    ),
+    "depthwise, with two results a channel": ("y = Conv<group=4>(x, twins)", {"Conv": 1}),
+    "two groups": ("y = Conv<pads=[1,1,1,1], group=2>(x, halves)", {"Conv": 1}),
+    "two groups, enlarged with output padding": (
+        """y = ConvTranspose<strides=[2,3], group=2, pads=[0,1,0,1], output_padding=[1,2]>(x, up)""",
+        {"ConvTranspose": 1},
     ),
     "a residual taken away": (f"{CONV} y = Sub(x, c)", {"Conv": 1, "Add": 1}),
-    "a convolution less the image": (f"{CONV} y = Sub(c, x)", {"Conv": 2, "Add": 1}),
+    "a convolution less the image": (f"{CONV} y = Sub(c, x)", {"Conv": 1, "Mul": 1, "Add": 1}),
     "normalised, and read elsewhere": (f"{CONV} n {NORMAL} y = Add(c, n)", {"Conv": 2, "Add": 1}),
     "added to the image as it is normalised": (
         f"""m = Mul(x, image) n = Sub(m, half) c = {SAME}(n, w) a = Add(n, c)
@@ -171,7 +192,7 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
     ),
     "one channel less four": (
         f"c = {SAME}(x, one) r = Relu(x) d = Sub(c, r) y = Mul(d, r)",
-        {"Conv": 3, "Relu": 1, "Add": 1, "Mul": 1},
+        {"Conv": 2, "Relu": 1, "Add": 1, "Mul": 2},
     ),
     "one channel and four, and no more": (
         f"c = {SAME}(x, one) d = {SAME}(x, w) y = Add(c, d)",
