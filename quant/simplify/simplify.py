@@ -201,12 +201,10 @@ def _is_plain(model: onnx.ModelProto) -> bool:
     if not is_of_plain_operators:
         return False
     graph = OnnxGraph(model)
-    rewritten = (
-        rewriting(graph, node)
-        for rewriting in (without_groups, split_large_kernel)
-        for node in graph.nodes
+    has_other_convolutions = any(
+        without_groups(graph, node) or split_large_kernel(graph, node) for node in graph.nodes
     )
-    return all(nodes is None for nodes in rewritten) and not broadcasts_channels(model)
+    return not has_other_convolutions and not broadcasts_channels(model)
 
 
 def _to_float32(model: onnx.ModelProto) -> None:

@@ -158,7 +158,8 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
     "depthwise, with two results a channel": ("y = Conv<group=4>(x, twins)", {"Conv": 1}),
     "two groups": ("y = Conv<pads=[1,1,1,1], group=2>(x, halves)", {"Conv": 1}),
     "two groups, enlarged with output padding": (
-        """y = ConvTranspose<strides=[2,3], group=2, pads=[0,1,0,1], output_padding=[1,2]>(x, up)""",
+        """y = ConvTranspose<strides=[2,3], group=2, pads=[0,1,0,1],
+        output_padding=[1,2]>(x, up)""",
         {"ConvTranspose": 1},
     ),
     "a residual taken away": (f"{CONV} y = Sub(x, c)", {"Conv": 1, "Add": 1}),
