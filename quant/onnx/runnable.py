@@ -103,7 +103,11 @@ def _filled(node: NodeProto, arrays: Mapping[str, np.ndarray], where: str) -> in
 LIST_VALUES = 4096
 """The maximum number of values of one list; a runtime computes with such lists in a moment."""
 
-COMPUTED = KEEPING | FILLING | {"Add", "Concat", "Div", "Gather", "Mul", "Shape", "Slice", "Sub"}
+COMPUTED = (
+    KEEPING
+    | FILLING
+    | {"Add", "Concat", "Div", "Equal", "Gather", "Mul", "Shape", "Slice", "Sub", "Where"}
+)
 """Operators whose results are computed if they are short lists of numbers."""
 
 

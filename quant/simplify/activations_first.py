@@ -120,7 +120,9 @@ def move_in_front(graph: OnnxGraph, node: Node) -> list[Node] | None:
         activation, or does not lead through such operations to convolutions.
     """
     moving = graph.sole_writer(node.inputs[0]) if node.op_type in ACTIVATIONS else None
-    if moving is None or not _leads_to_convolutions(graph, node, moving):
+    # The host clips the result.
+    is_end = node.op_type == "Clip" and node.outputs[0] in graph.outputs
+    if moving is None or is_end or not _leads_to_convolutions(graph, node, moving):
         return None
     activations = [
         Node.new(

@@ -1,9 +1,15 @@
-"""Convert a network whose image has its channels last (N, H, W, C) to channels first.
+"""Convert networks, and parts of them, that have channels last (N, H, W, C) to channels first.
 
-1. Exporters from TensorFlow transpose the image as the first node, and the result as the last.
-2. In that case both nodes are removed, and input and output are (N, C, H, W), as in all other
-   networks.
+Exporters from TensorFlow transpose the image in front of the first convolution, and the result at
+the end. Linear layers of torch stand between two such nodes.
+
+1. A Transpose to channels last is moved behind operations on each value, concats and products with
+   a matrix, which become convolutions of one pixel. One to channels first then undoes it.
+2. If the image has its channels last, it is treated as one of channels first that is transposed
+   before anything else. The result is treated likewise.
 """
+
+from copy import deepcopy
 
 import onnx
 
@@ -11,45 +17,95 @@ from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 
 TO_FIRST = [0, 3, 1, 2]
 TO_LAST = [0, 2, 3, 1]
+ON_VALUES = {
+    *("Abs", "Add", "Cast", "Clip", "Div", "Dropout", "Elu", "Erf", "Exp", "Gelu", "HardSigmoid"),
+    *("HardSwish", "Identity", "LeakyRelu", "Log", "Max", "Min", "Mul", "Neg", "PRelu", "Pow"),
+    *("Relu", "Sigmoid", "Softplus", "Sqrt", "Sub", "Sum", "Tanh"),
+}
+"""Operators on each value, which no order of axes changes."""
 
 
 def channels_first(model: onnx.ModelProto) -> None:
-    """Convert a network whose image has its channels last, and its result as well, to channels
-    first.
-
-    A network that does not transpose its image to channels first in its first nodes is unchanged.
+    """Convert what has its channels last in a network to channels first.
 
     Args:
         model: a float network, which is changed in place.
     """
-    graph = OnnxGraph(model)
-    images = [name for name in graph.inputs if _is_transposed(graph.readers[name], TO_FIRST)]
-    results = [
-        name
-        for name in graph.outputs
-        if name in graph.writers and _is_transposed([graph.writers[name]], TO_LAST)
-    ]
-    if not images:
+    if not any(_is_transpose(node, TO_FIRST) for node in OnnxGraph(model).nodes):
         return
+    network = deepcopy(model)
+    graph = OnnxGraph(network)
+    for name in graph.inputs:
+        first = Node.new("Transpose", [name], f"{name}.last", f"{name}.last", perm=TO_LAST)
+        for node in graph.readers[name]:
+            node.inputs = tuple(first.outputs[0] if each == name else each for each in node.inputs)
+        graph.set_nodes([first, *graph.nodes])
+    graph.rewrite(_moved_behind)
+    graph.save()
+    ends = [node for node in graph.nodes if _is_transpose(node, TO_LAST)]
+    if any(node.outputs[0] not in graph.outputs for node in ends):
+        # The image has its channels first.
+        graph = OnnxGraph(model)
+        graph.rewrite(_moved_behind)
+        graph.save()
+        return
+    results = [node.outputs[0] for node in ends]
 
     def without(_: OnnxGraph, node: Node) -> list[Node] | None:
-        is_end = node.inputs[0] in images or node.outputs[0] in results
-        if node.op_type != "Transpose" or not is_end:
-            return None
-        return [Node.new("Identity", node.inputs, node.outputs[0], node.name)]
+        is_end = node.outputs[0] in results
+        return [Node.new("Identity", node.inputs, node.outputs[0], node.name)] if is_end else None
 
     graph.rewrite(without)
     graph.save()
-    for value in (*model.graph.input, *model.graph.output):
-        if value.name in (*images, *results):
-            dims = value.type.tensor_type.shape.dim
+    for value in (*network.graph.input, *network.graph.output):
+        dims = value.type.tensor_type.shape.dim
+        if len(dims) == 4 and (value.name in graph.inputs or value.name in results):
             channels = dims.pop()
             dims.insert(1, channels)
+    network.graph.ClearField("value_info")
+    model.CopyFrom(network)
 
 
-def _is_transposed(nodes: list[Node], order: list[int]) -> bool:
-    """Return True if these nodes exist and all transpose in this order."""
-    return bool(nodes) and all(
-        node.op_type == "Transpose" and list(node.attributes.get("perm", [])) == order
-        for node in nodes
-    )
+def _moved_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Move the Transposes to channels last in front of a node behind it (1)."""
+    names = [name for name in node.inputs if name and name not in graph.constants]
+    writers = [graph.writers.get(name) for name in names]
+    sources = {
+        writer.outputs[0]: writer.inputs[0]
+        for writer in writers
+        if writer is not None and _is_transpose(writer, TO_LAST)
+    }
+    if not names or sources.keys() != {*names} or len(node.outputs) > 1:
+        return None
+    (result,) = node.outputs
+    if _is_transpose(node, TO_FIRST):
+        return [Node.new("Identity", sources.values(), result, node.name)]
+    first = f"{result}.first"
+    matrix = graph.value(node, 1)
+    is_product = node.op_type == "MatMul" and matrix is not None and matrix.ndim == 2
+    if is_product and matrix is not None:
+        weight = matrix.T[:, :, None, None]
+        moved = graph.convolution(sources[names[0]], first, node.name, weight)
+    elif node.op_type in ON_VALUES or node.op_type == "Concat":
+        inputs = [sources.get(name) or _of_first(graph, name) for name in node.inputs]
+        attributes = dict(node.attributes)
+        if node.op_type == "Concat":
+            attributes["axis"] = TO_LAST[attributes["axis"] % 4]
+        moved = Node.new(node.op_type, inputs, first, node.name, **attributes)
+    else:
+        return None
+    return [moved, Node.new("Transpose", [first], result, f"{result}.last", perm=TO_LAST)]
+
+
+def _of_first(graph: OnnxGraph, name: str) -> str:
+    """Return the name of a constant of channels last with its channels first; an omitted one."""
+    value = graph.constants.get(name)
+    if value is None or value.size == 1:
+        return name
+    value = value.reshape((1,) * (4 - value.ndim) + value.shape).transpose(TO_FIRST)
+    return graph.add_constant(f"{name}.first", value, value.dtype)
+
+
+def _is_transpose(node: Node, order: list[int]) -> bool:
+    """Return True if a node transposes in this order."""
+    return node.op_type == "Transpose" and list(node.attributes.get("perm", [])) == order

@@ -2,10 +2,10 @@
 them.
 
 1. Set the free sizes of the image to numbers, so that the runtime folds arithmetic on shapes.
-2. Write a Resize to a size as one by factors, the pixel unshuffle of one channel as SpaceToDepth,
-   and that of several channels within the network, and a shuffle of channels, as a convolution.
-   Remove a Pad by nothing, a Slice of the whole map, and an Expand that arithmetic does anyway. Let
-   a convolution repeat a channel, and write a map of one number per channel, such as a noise level.
+2. Write a Resize to a size as one by factors, and what only moves and repeats values as one
+   operator (`rearrangements`). Remove a Pad by nothing, a Slice of the whole map, and an Expand
+   that arithmetic does anyway. Let a convolution repeat a channel, and write a map of one number
+   per channel, such as a noise level.
 3. Do both for two sizes. If the networks are equal, the size has no effect, and theirs is the
    network of every image whose sides are multiples of `MULTIPLE_PX`. Otherwise the network is not
    changed.
@@ -23,6 +23,7 @@ import onnx
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
 from beers_deploy.quant.simplify.rearrangements import (
+    OF_BLOCKS,
     RESHAPING,
     is_rearrangement,
     rearranged,
@@ -125,14 +126,7 @@ def _sized(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> l
     if len(before) != 4 or len(after) != 4 or min(*before, *after) < 1:
         return None
     if node.op_type == "Resize" and len(node.inputs) == 4:
-        factors = np.divide(after, before)
-        # Other factors may be rounded, and the result have another size.
-        if not all(factor == int(factor) for factor in factors):
-            return None
-        scales = graph.add_constant(f"{node.name}.scales", factors)
-        attributes = {k: v for k, v in node.attributes.items() if k != "keep_aspect_ratio_policy"}
-        inputs = [source, "", scales]
-        return [Node.new("Resize", inputs, node.outputs[0], node.name, **attributes)]
+        return _by_factors(graph, node, before, after)
     if node.op_type == "Expand":
         return _expanded(graph, node, sizes)
     if node.op_type == "Concat":
@@ -146,6 +140,24 @@ def _sized(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> l
     if keeps_all or adds_nothing or node.op_type in RESHAPING:
         return [Node.new("Identity", [source], node.outputs[0], node.name)]
     return None
+
+
+def _by_factors(
+    graph: OnnxGraph, node: Node, before: tuple[int, ...], after: tuple[int, ...]
+) -> list[Node] | None:
+    """Return a Resize by factors in place of one to a size; None if no whole number divides one of
+    the sizes into the other, so that factors may be rounded, and the result have another size.
+    """
+    factors = np.divide(after, before)
+    if any(factor % 1 and (1 / factor) % 1 for factor in factors):
+        return None
+    scales = graph.add_constant(f"{node.name}.scales", factors)
+    attributes = {k: v for k, v in node.attributes.items() if k != "keep_aspect_ratio_policy"}
+    # One pixel is the same in all modes.
+    if before[2:] == (1, 1):
+        attributes = OF_BLOCKS
+    inputs = [node.inputs[0], "", scales]
+    return [Node.new("Resize", inputs, node.outputs[0], node.name, **attributes)]
 
 
 def _expanded(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> list[Node] | None:

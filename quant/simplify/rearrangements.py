@@ -1,15 +1,18 @@
-"""Write shuffles of channels and pixel unshuffles, which exporters spell by Reshape and Transpose,
-as one operator.
+"""Write chains of nodes that only move and repeat values as one operator.
 
-1. A shuffle of channels is a Reshape to (N, groups, C / groups, H, W), a Transpose of groups and
-   members, and a Reshape back. It becomes a convolution of one pixel that moves each channel.
-2. A pixel unshuffle is a Reshape to (N, C, H, r, W, r), a Transpose to (N, C, r, r, H, W), and a
-   Reshape. Of one channel it becomes a SpaceToDepth. ONNX orders several channels in another way,
-   so it becomes a convolution of r x r pixels and stride r that moves each value; the host
+Exporters spell shuffles of channels, pixel unshuffles and repeated channels or pixels by Reshape,
+Transpose, Expand and Tile. Such a chain is tested on a map of numbered values:
+
+1. If each channel of the result is a channel of the map, or one place of its blocks of r x r
+   pixels, it is a convolution of r x r pixels and stride r that selects them. A pixel unshuffle of
+   one channel is a SpaceToDepth. ONNX orders several channels in another way, and the host
    unshuffles an image of several channels.
+2. If each pixel becomes a block, it is a nearest Resize.
 
 All of it is exact.
 """
+
+import math
 
 import numpy as np
 
@@ -19,22 +22,29 @@ Sizes = dict[str, tuple[int, ...]]
 
 RESHAPING = {"Flatten", "Reshape", "Squeeze", "Unsqueeze"}
 """Operators that move no value."""
-
-
-SHUFFLE = [0, 2, 1, 3, 4]
-UNSHUFFLE = [0, 1, 3, 5, 2, 4]
-"""The transpositions of the two."""
+MOVING = RESHAPING | {"Expand", "Tile", "Transpose"}
+PIXEL_SHUFFLES = [0, 1, 4, 2, 5, 3], [0, 3, 4, 1, 5, 2]
+"""The transpositions of enlarging pixel shuffles, which stay."""
+OF_BLOCKS = {
+    "mode": "nearest",
+    "coordinate_transformation_mode": "asymmetric",
+    "nearest_mode": "floor",
+}
+"""Attributes of a Resize that makes a block of each pixel."""
+MOST_VALUES = 1 << 24
+"""The largest map that chains are tested on."""
 
 
 def is_rearrangement(graph: OnnxGraph, node: Node) -> bool:
-    """Return True for the Transpose of a shuffle or unshuffle within a network, behind the image.
+    """Return True if a node may belong to such a chain within a network, behind the image.
 
     Args:
         graph: the graph that the node belongs to.
         node: any node.
     """
-    is_one = node.op_type == "Transpose" and node.attributes.get("perm") in (SHUFFLE, UNSHUFFLE)
-    return is_one and _before_reshapes(graph, node.inputs[0]) not in graph.inputs
+    perm = node.attributes.get("perm", ())
+    is_one = len(perm) > 4 and perm not in PIXEL_SHUFFLES
+    return node.op_type == "Tile" or (is_one and _chain(graph, node)[0] not in graph.inputs)
 
 
 def rearranged(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
@@ -46,70 +56,66 @@ def rearranged(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
         sizes: the sizes of each tensor, for images of one size.
 
     Returns:
-        The operator; None if the nodes are neither a shuffle of channels nor a pixel unshuffle.
+        The operator; None if there is none for them.
     """
-    moved = graph.sole_writer(_before_reshapes(graph, node.inputs[0]))
-    if moved is None or moved.op_type != "Transpose":
+    source, chain = _chain(graph, node)
+    before = sizes.get(source, ())
+    result = node.outputs[0]
+    after = sizes.get(result, ())
+    if len(before) != 4 or len(after) != 4 or not 0 < math.prod(before) <= MOST_VALUES:
         return None
-    source = _before_reshapes(graph, moved.inputs[0])
-    split = sizes.get(moved.inputs[0], ())
-    ends = sizes.get(source, ()), sizes[node.outputs[0]]
-    perm = moved.attributes.get("perm")
-    weight = None
-    stride = 1
-    if perm == SHUFFLE and len(split) == 5:
-        weight = _channel_shuffle(split, ends)
-    elif perm == UNSHUFFLE and len(split) == 6:
-        weight = _unshuffle(split, ends)
-        stride = split[3]
-    if weight is None:
+    image = np.arange(math.prod(before)).reshape(before)
+    moved = image
+    for each in chain:
+        moved = _moved(moved, each, sizes[each.outputs[0]])
+    if after[2] > before[2]:
+        return _enlarged(graph, node, source, image, moved)
+    block = before[2] // after[2]
+    channels = before[1]
+    if (after[2] * block, after[3] * block) != before[2:]:
         return None
-    if stride > 1 and weight.shape[1] == 1:
-        return [Node.new("SpaceToDepth", [source], node.outputs[0], node.name, blocksize=stride)]
-    if stride > 1 and source in graph.inputs:
+    blocks = image.reshape(-1, channels, after[2], block, after[3], block)
+    blocks = blocks.transpose(0, 1, 3, 5, 2, 4).reshape(before[0], -1, *after[2:])
+    # The numbers grow from channel to channel, and from place to place.
+    order = np.searchsorted(blocks[0, :, 0, 0], moved[0, :, 0, 0]) % blocks.shape[1]
+    if not np.array_equal(blocks[:, order], moved):
         return None
-    strides = [stride, stride]
-    return [graph.convolution(source, node.outputs[0], node.name, weight, strides=strides)]
-
-
-def _before_reshapes(graph: OnnxGraph, name: str) -> str:
-    """Return the tensor that operators which move no value turn into this one."""
-    writer = graph.sole_writer(name)
-    while writer is not None and writer.op_type in RESHAPING:
-        name = writer.inputs[0]
-        writer = graph.sole_writer(name)
-    return name
-
-
-def _channel_shuffle(
-    split: tuple[int, ...], ends: tuple[tuple[int, ...], tuple[int, ...]]
-) -> np.ndarray | None:
-    """Return the weights (C, C, 1, 1) of a shuffle of channels; None if the sizes are not its own.
-
-    Args:
-        split: sizes (N, groups, C / groups, H, W) that the Transpose reads.
-        ends: sizes of the map before and after.
-    """
-    count, groups, members, rows, columns = split
-    channels = groups * members
-    if ends != ((count, channels, rows, columns),) * 2:
+    if block > 1 and np.array_equal(order, np.arange(block * block)):
+        return [Node.new("SpaceToDepth", [source], result, node.name, blocksize=block)]
+    if block > 1 and source in graph.inputs:
         return None
-    order = np.arange(channels).reshape(groups, members).T.ravel()
-    return np.eye(channels)[order][:, :, None, None]
+    weight = np.eye(blocks.shape[1])[order].reshape(-1, channels, block, block)
+    return [graph.convolution(source, result, node.name, weight, strides=[block, block])]
 
 
-def _unshuffle(
-    split: tuple[int, ...], ends: tuple[tuple[int, ...], tuple[int, ...]]
-) -> np.ndarray | None:
-    """Return the weights (C r r, C, r, r) of a pixel unshuffle; None if the sizes are not its own.
-
-    Args:
-        split: sizes (N, C, H / r, r, W / r, r) that the Transpose reads.
-        ends: sizes of the map before and after.
-    """
-    count, channels, rows, block, columns, across = split
-    whole = count, channels, rows * block, columns * block
-    values = channels * block * block
-    if block != across or ends != (whole, (count, values, rows, columns)):
+def _enlarged(
+    graph: OnnxGraph, node: Node, source: str, image: np.ndarray, moved: np.ndarray
+) -> list[Node] | None:
+    """Return the Resize that moves the numbers of a map so; None if it is no enlargement (2)."""
+    factor = moved.shape[2] // image.shape[2]
+    if not np.array_equal(moved, image.repeat(factor, 2).repeat(factor, 3)):
         return None
-    return np.eye(values).reshape(values, channels, block, block)
+    result = node.outputs[0]
+    scales = graph.add_constant(f"{result}.scales", np.array([1, 1, factor, factor]))
+    return [Node.new("Resize", [source, "", scales], result, node.name, **OF_BLOCKS)]
+
+
+def _chain(graph: OnnxGraph, node: Node) -> tuple[str, list[Node]]:
+    """Return the tensor that a chain up to this node begins with, and its nodes in order."""
+    chain = [node]
+    writer = graph.sole_writer(node.inputs[0])
+    while writer is not None and writer.op_type in MOVING:
+        chain.insert(0, writer)
+        writer = graph.sole_writer(writer.inputs[0])
+    return chain[0].inputs[0], chain
+
+
+def _moved(values: np.ndarray, node: Node, size: tuple[int, ...]) -> np.ndarray:
+    """Return the result of a node of this size."""
+    if node.op_type == "Transpose":
+        return values.transpose(node.attributes.get("perm"))
+    if node.op_type == "Expand":
+        return np.broadcast_to(values, size)
+    if node.op_type == "Tile":
+        return np.tile(values, np.floor_divide(size, values.shape))
+    return values.reshape(size)

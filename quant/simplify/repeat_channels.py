@@ -10,11 +10,14 @@ import onnx
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.standard_operators import Shapes, channels_in, float_shapes
 
+HOST = {"Clip", "DepthToSpace"}
+"""Operators that the host computes behind the sum with the image."""
+
 
 def repeat_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Let a convolution repeat the channels of a map that a Tile or arithmetic repeats.
 
-    The image is left as it is: the host adds it to each channel of a result.
+    The image that is added at the end is left as it is: the host adds it to each channel.
 
     Args:
         shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
@@ -61,4 +64,8 @@ def _narrow_input(shapes: Shapes, graph: OnnxGraph, node: Node) -> str | None:
         return None
     widths = [channels_in(shapes, name) for name in node.inputs]
     narrow = node.inputs[int(widths[0] > widths[1])]
-    return narrow if min(widths) == 1 < max(widths) and narrow not in graph.inputs else None
+    result = node.outputs[0]
+    readers = {reader.op_type for reader in graph.readers[result]}
+    is_end = node.op_type == "Add" and (result in graph.outputs or readers <= HOST)
+    is_repeated = min(widths) == 1 < max(widths) and not (is_end and narrow in graph.inputs)
+    return narrow if is_repeated else None

@@ -51,7 +51,6 @@ from beers_deploy.quant.simplify.activations_first import (
     behind_convolutions,
 )
 from beers_deploy.quant.simplify.channels_first import channels_first
-from beers_deploy.quant.simplify.crop_borders import convolve_crop
 from beers_deploy.quant.simplify.fold_affine import (
     add_negated,
     convolve_affine,
@@ -64,17 +63,19 @@ from beers_deploy.quant.simplify.grouped_convolutions import without_groups
 from beers_deploy.quant.simplify.image_residual import add_to_image, clip_last
 from beers_deploy.quant.simplify.large_kernels import split_large_kernel
 from beers_deploy.quant.simplify.missing_border import with_missing_border
+from beers_deploy.quant.simplify.pixel_slices import convolve_slice
 from beers_deploy.quant.simplify.repeat_channels import broadcasts_channels, repeat_channels
 from beers_deploy.quant.simplify.spelled_activations import (
     halve_before_gelu,
+    join_clips,
     join_hard_swish,
-    join_relu,
 )
 from beers_deploy.quant.simplify.split_channels import split_channels
 from beers_deploy.quant.simplify.standard_operators import (
     drop_cast,
     float_shapes,
     pool_mean,
+    shrink_by_convolution,
     split_sums,
 )
 from beers_deploy.quant.simplify.strided_slices import unshuffle_slices
@@ -155,7 +156,7 @@ def _run_passes(model: onnx.ModelProto) -> None:
     graph.save()
     for rewriting in (
         split_sums,
-        join_relu,
+        join_clips,
         join_hard_swish,
         halve_before_gelu,
         partial(add_negated, float_shapes(graph)),
@@ -172,10 +173,11 @@ def _run_passes(model: onnx.ModelProto) -> None:
         repeat_channels,
         drop_cast,
         pool_mean,
+        shrink_by_convolution,
         convolve_affine,
         unshuffle_slices,
         split_channels,
-        convolve_crop,
+        convolve_slice,
     ):
         graph.rewrite(partial(with_shapes, shapes))
     # A normalisation that has become a convolution takes in what stands around it.

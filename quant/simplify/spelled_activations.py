@@ -1,6 +1,6 @@
 """Replace activations that exporters write as several operators by the one operator that a DPU has.
 
-1. A Clip at 0 without an upper limit, and a Max with 0, are ReLU.
+1. Clip, Max, Min and ReLU, also one after the other, are ReLU, or ReLU6 of a scaled map.
 2. A shift by 3, a clip from 0 to 6 and a sixth are HardSigmoid. They are HardSwish if they are
    multiplied by the tensor itself, in any order.
 3. GELU, x (1 + Erf(x / sqrt(2))) / 2, stays spelled out, but its half comes first. Behind the
@@ -20,28 +20,76 @@ SLOPE_AND_OFFSET = {"alpha": 1 / 6, "beta": 0.5}
 """Slope and offset of the HardSigmoid in HardSwish; ONNX's default slope differs."""
 
 
-def join_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a Clip or a Max that computes a ReLU by Relu (point 1 of the module).
+def join_clips(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace nodes that clip one after the other by one Relu or Clip from 0 to 6 (point 1 of the
+    module).
 
     Args:
-        graph: the graph that the node belongs to.
+        graph: the graph that the node belongs to; its constants are extended.
         node: any node.
 
     Returns:
-        The Relu; None if the node is something else.
+        The activation, between a scaling and its inverse if it has other limits. None if the node
+        is something else.
     """
-    source = None
-    if node.op_type == "Clip":
-        low = _scalar(graph, node, 1)
-        has_limit = len(node.inputs) > 2 and node.inputs[2] != ""
-        high = _scalar(graph, node, 2) if has_limit else np.inf
-        if low == 0 and high is not None and high > UNLIMITED:
-            source = node.inputs[0]
-    else:
-        source = other_operand(graph, node, "Max", 0)
-    if source is None:
+    low = -np.inf
+    high = np.inf
+    writer: Node | None = node
+    source = ""
+    count = 0
+    while writer is not None and (step := _limits(graph, writer)) is not None:
+        source, *limits = step
+        low, high = (float(np.clip(limit, low, high)) for limit in limits)
+        writer = graph.sole_writer(source)
+        count += 1
+    result = node.outputs[0]
+    if count == 1 and (node.op_type == "Relu" or (low, high) == (0, 6)):
         return None
-    return [Node.new("Relu", [source], node.outputs[0], node.name)]
+    if low == 0 and high == np.inf:
+        return [Node.new("Relu", [source], result, node.name)]
+    readers = {reader.op_type for reader in graph.readers[result]}
+    is_last = result in graph.outputs or "DepthToSpace" in readers
+    if is_last or not -np.inf < low < high < np.inf:
+        return None
+    unit = (high - low) / 6
+
+    def constant(role: str, value: float) -> str:
+        return graph.add_constant(f"{result}.{role}", np.array(value))
+
+    ends = [constant("zero", 0), constant("six", 6)]
+    if (low, high) == (0, 6):
+        return [Node.new("Clip", [source, *ends], result, node.name)]
+    names = [f"{result}.{role}" for role in ("shifted", "divided", "clipped", "times")]
+    shifted, divided, clipped, times = names
+    return [
+        Node.new("Sub", [source, constant("low", low)], shifted, shifted),
+        Node.new("Div", [shifted, constant("unit", unit)], divided, divided),
+        Node.new("Clip", [divided, *ends], clipped, node.name),
+        Node.new("Mul", [clipped, constant("unit", unit)], times, times),
+        Node.new("Add", [times, constant("low", low)], result, f"{result}.raised"),
+    ]
+
+
+def _limits(graph: OnnxGraph, node: Node) -> tuple[str, float, float] | None:
+    """Return the tensor that a node clips, and the low and the high limit; None for another."""
+    source = node.inputs[0] if node.inputs else ""
+    if node.op_type == "Relu":
+        return source, 0.0, np.inf
+    if node.op_type == "Clip":
+        low, high = (
+            _scalar(graph, node, place) if any(node.inputs[place : place + 1]) else limit
+            for place, limit in ((1, -np.inf), (2, np.inf))
+        )
+        if low is None or high is None:
+            return None
+        return source, low, high if high < UNLIMITED else np.inf
+    if node.op_type in ("Max", "Min") and len(node.inputs) == 2:
+        for place in (0, 1):
+            limit = _scalar(graph, node, 1 - place)
+            if limit is not None:
+                ends = (limit, np.inf) if node.op_type == "Max" else (-np.inf, limit)
+                return (node.inputs[place], *ends)
+    return None
 
 
 def join_hard_swish(graph: OnnxGraph, node: Node) -> list[Node] | None:
@@ -169,6 +217,7 @@ def other_operand(graph: OnnxGraph, node: Node | None, kind: str, number: float)
 
 
 def _scalar(graph: OnnxGraph, node: Node, place: int) -> float | None:
-    """Return a constant of one number that a node reads; None if it reads none there."""
+    """Return a constant float of one number that a node reads; None if it reads none there."""
     value = graph.value(node, place)
-    return float(value.item()) if value is not None and value.size == 1 else None
+    is_number = value is not None and value.size == 1 and value.dtype.kind == "f"
+    return float(value.item()) if is_number and value is not None else None

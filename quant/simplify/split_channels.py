@@ -1,6 +1,6 @@
 """Compute each part of a map's channels by separate operations, so that nothing splits a map.
 
-1. A Split, or a Slice, along the channels has parts, each a list of channels.
+1. A Split, Slice or Gather along the channels has parts, each a list of channels.
 2. If only such nodes read a map, and a convolution writes it, each part becomes a convolution with
    the weights of its channels. Activations and depthwise convolutions in between are divided with
    it. The amount of computation does not change.
@@ -22,7 +22,7 @@ Part = tuple[str, np.ndarray]
 
 
 def split_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a Split, or a Slice of channels, by operations that compute each part by itself
+    """Replace a Split, Slice or Gather of channels by operations that compute each part by itself
     (point 1 of the module).
 
     Args:
@@ -59,6 +59,9 @@ def _parts(graph: OnnxGraph, node: Node, shapes: Shapes) -> list[Part]:
         if not all(widths):
             return []
         return list(zip(node.outputs, np.split(numbers, np.cumsum(widths[:-1])), strict=True))
+    chosen = graph.value(node, 1) if node.op_type == "Gather" else None
+    if chosen is not None and chosen.ndim == 1 and node.attributes.get("axis", 0) in CHANNEL_AXIS:
+        return [(node.outputs[0], numbers[chosen])]
     cuts = slices_of(graph, node) if node.op_type == "Slice" else {}
     return [(node.outputs[0], numbers[cuts[1]])] if cuts.keys() == {1} else []
 

@@ -1,10 +1,22 @@
 """Replace operators that exporters write in several ways by the one operator that a DPU has."""
 
+from collections.abc import Callable
+
+import numpy as np
 from onnx import TensorProto
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
 
 Shapes = dict[str, tuple[int, ...]]
+
+HALF_PIXEL = "half_pixel", "pytorch_half_pixel"
+NEAREST: dict[str, Callable[[float], float]] = {
+    "ceil": np.ceil,
+    "floor": np.floor,
+    "round_prefer_ceil": lambda place: np.floor(place + 0.5),
+    "round_prefer_floor": lambda place: np.ceil(place - 0.5),
+}
+"""How each mode of a nearest Resize rounds a place."""
 
 
 def float_shapes(graph: OnnxGraph) -> Shapes:
@@ -96,7 +108,7 @@ def drop_cast(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None
 
 def pool_mean(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a mean over rows and columns by GlobalAveragePool, and a Flatten if both axes are
-    dropped.
+    dropped, and a sum or mean over channels by a convolution of one pixel.
 
     Args:
         shapes: the sizes of each float tensor by name, as `float_shapes` returns them. That of a
@@ -107,12 +119,20 @@ def pool_mean(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None
     Returns:
         The nodes that replace the mean; None if the node is something else.
     """
+    size = shapes.get(node.inputs[0], ()) if node.op_type in ("ReduceMean", "ReduceSum") else ()
     # From opset 18 on the axes are an input.
-    axes = {axis % 4 for axis in graph.numbers(node, 1, "axes") or ()}
-    size = shapes.get(node.inputs[0], ()) if node.op_type == "ReduceMean" else ()
-    if len(size) != 4 or axes != {2, 3}:
+    axes = {axis % 4 for axis in graph.numbers(node, 1, "axes") or ()} if size else set()
+    (output, *_) = node.outputs
+    if axes == {1} and len(size) == 4 and size[1] and node.attributes.get("keepdims", 1):
+        # A layer normalisation, which has a root, is refused by its mean.
+        if any(other.op_type == "Sqrt" for other in graph.nodes):
+            return None
+        weight = np.ones((1, size[1], 1, 1))
+        if node.op_type == "ReduceMean":
+            weight /= size[1]
+        return [graph.convolution(node.inputs[0], output, node.name, weight)]
+    if len(size) != 4 or axes != {2, 3} or node.op_type != "ReduceMean":
         return None
-    (output,) = node.outputs
     if node.attributes.get("keepdims", 1):
         return [Node.new("GlobalAveragePool", node.inputs[:1], output, node.proto.name)]
     pooled = f"{output}.pooled"
@@ -120,4 +140,44 @@ def pool_mean(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None
     return [
         Node.new("GlobalAveragePool", node.inputs[:1], pooled, node.proto.name),
         Node.new("Flatten", [pooled], output, f"{output}.flat"),
+    ]
+
+
+def shrink_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace a Resize to every n-th part of rows and columns by a depthwise convolution.
+
+    Its kernel of n x n pixels and stride n has the weights of the interpolation.
+
+    Args:
+        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
+        graph: the graph that the node belongs to; its constants are extended.
+        node: any node.
+
+    Returns:
+        The convolution; None if the node is something else, or reads pixels beyond its block.
+    """
+    factors = graph.numbers(node, 2, "scales") if node.op_type == "Resize" else None
+    channels = channels_in(shapes, node.inputs[0]) if factors else 0
+    attribute = node.attributes.get
+    where = attribute("coordinate_transformation_mode", "half_pixel")
+    mode = attribute("mode", "nearest")
+    if not factors or not channels or factors[2] != factors[3] or not 0 < factors[2] < 1:
+        return None
+    block = round(1 / factors[2])
+    # The place in a block that the result is interpolated at.
+    places = {"asymmetric": 0.0, **dict.fromkeys(HALF_PIXEL, (block - 1) / 2)}
+    is_known = where in places and mode in ("linear", "nearest") and not attribute("antialias", 0)
+    if not is_known or not np.isclose(block * factors[2], 1, atol=1e-6):
+        return None
+    place = places[where]
+    if mode == "nearest":
+        place = NEAREST[attribute("nearest_mode", "round_prefer_floor")](place)
+    taps = np.maximum(1 - abs(np.arange(block) - place), 0)
+    weight = np.broadcast_to(np.outer(taps, taps), (channels, 1, block, block))
+    strides = [block, block]
+    result = node.outputs[0]
+    return [
+        graph.convolution(
+            node.inputs[0], result, node.name, weight, strides=strides, group=channels
+        )
     ]

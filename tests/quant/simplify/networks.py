@@ -37,6 +37,7 @@ NUMBERS = {
     "around": [0, 0, 1, 2, 0, 0, 2, 1],
     "small": [2, 4, 2, 3],
     "rows": [0, -1],
+    "order": [2, 0, 3],
     "one_int": [1],
     "two": [2],
     "four": [4],
@@ -156,6 +157,11 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         {"Clip": 2, "Add": 2, "Mul": 1, "Relu": 1, "Conv": 2},
     ),
     "depthwise, with two results a channel": ("y = Conv<group=4>(x, twins)", {"Conv": 1}),
+    "channels in another order": (f"{CONV} y = Gather<axis=1>(c, order)", {"Conv": 1}),
+    "ReLU6 in two steps": (
+        f"{CONV} k = Max(c, zero) l = Min(six, k) y = {SAME}(l, w)",
+        {"Conv": 2, "Clip": 1},
+    ),
     "two groups": ("y = Conv<pads=[1,1,1,1], group=2>(x, halves)", {"Conv": 1}),
     "two groups, enlarged with output padding": (
         """y = ConvTranspose<strides=[2,3], group=2, pads=[0,1,0,1],
@@ -254,7 +260,7 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         y = Unsqueeze(g, axes)""",
         {"GlobalAveragePool": 1, "Conv": 1, "Flatten": 1, "Unsqueeze": 1},
     ),
-    "a mean over channels": ("y = ReduceMean<axes=[1]>(x)", {"ReduceMean": 1}),
+    "a mean over channels": ("y = ReduceMean<axes=[1]>(x)", {"Conv": 1}),
     "three summed": (f"{CONV} d = {SAME}(c, w) y = Sum(x, c, d)", {"Conv": 2, "Add": 2}),
     "what does nothing": (
         f"i = Identity(x) c = {SAME}(i, w) d = Dropout(c) y = Cast<to=1>(d)",

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 
 from beers_deploy.quant.graph import read_network, refusal
 from beers_deploy.quant.session import open_session, result_of
@@ -39,6 +41,50 @@ def test_a_network_of_channels_last_becomes_one_of_channels_first() -> None:
     before = result_of(open_session(model), np.moveaxis(IMAGE, 1, 3))
     after = result_of(open_session(short), IMAGE)
     np.testing.assert_allclose(np.moveaxis(after, 1, 3), before, rtol=1e-5)
+
+
+PARTS = (
+    "Relu({})",
+    "Add({}, image_last)",
+    "Div(three, {})",
+    "PRelu({}, image_last)",
+    "MatMul({}, square)",
+    "Concat<axis=-1>({}, u)",
+    "Clip({}, , six)",
+)
+"""Operators on a tensor of channels last, which stands in the place of the braces."""
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.sampled_from(PARTS), max_size=4), st.booleans())
+def test_channels_that_are_last_between_other_layers_become_first(
+    parts: list[str], image_last: bool
+) -> None:
+    """Linear layers of torch stand so in a network, and the scaling of an image by Keras."""
+    to_first = "Transpose<perm=[0,3,1,2]>"
+    to_last = "Transpose<perm=[0,2,3,1]>"
+    tensors = ["u", *(f"t{k}" for k in range(1, len(parts) + 1))]
+    inner = " ".join(
+        f"{to} = {part.format(x)}" for part, (x, to) in zip(parts, pairwise(tensors), strict=True)
+    )
+    channels = CHANNELS * (1 + any("Concat" in part for part in parts))
+    assume(not any("Concat" in part for part in parts[:-1]))
+    first = f"u = {to_last}(x)"
+    sizes = f"[N,{CHANNELS},H,W]"
+    if image_last:
+        first = "u = Identity(x)"
+        sizes = f"[N,H,W,{CHANNELS}]"
+    model = made(
+        f"{first} {inner} v = {to_first}({tensors[-1]}) y = Conv(v, end)",
+        ends=f"float{sizes} x => float[N,1,H2,W2] y",
+        image_last=np.linspace(0.5, 1, CHANNELS),
+        end=np.ones((1, channels, 1, 1)),
+    )
+    short = simplify(model, "a.onnx")
+    assert "Transpose" not in {n.op_type for n in short.graph.node}
+    image = 1 + IMAGE
+    before = result_of(open_session(model), np.moveaxis(image, 1, 3) if image_last else image)
+    np.testing.assert_allclose(result_of(open_session(short), image), before, rtol=1e-4)
 
 
 @pytest.mark.parametrize("layers", [1, 2, 5])

@@ -61,7 +61,11 @@ PARTS = {
     "depthwise": "Conv<pads=[1,1,1,1], group=4>({}, deep)",
     "transposed": "ConvTranspose<strides=[2,2], group=2>({}, up)",
     "normal": "BatchNormalization({}, gain, offset, mean, variance)",
+    "groups": "Conv<pads=[1,1,1,1], group=2>({}, pairs)",
     "from six": "Sub(six, {})",
+    "clipped": "Clip({}, half, three)",
+    "at most six": "Min(six, {})",
+    "Neg": "Neg({})",
     "Relu": "Relu({})",
     **{kind: f"{kind}({{}}, image)" for kind in ("Add", "Sub", "Mul", "Div")},
 }
@@ -76,7 +80,7 @@ def test_what_works_on_each_channel_is_folded_into_convolutions(parts: list[str]
         f"{to} = {PARTS[part].format(x)}"
         for part, (x, to) in zip(parts, pairwise(tensors), strict=True)
     ]
-    model = made(" ".join(nodes))
+    model = made(" ".join(nodes), pairs=np.random.default_rng(2).normal(0, 0.5, (4, 2, 3, 3)))
     short = simplify(model, "a.onnx")
     (before,) = results(model)
     (after,) = results(short)
@@ -91,7 +95,7 @@ def test_what_works_on_each_channel_is_folded_into_convolutions(parts: list[str]
     assert "BatchNormalization" not in kind.values()
     for n in short.graph.node:
         sources = CONVOLUTIONS.intersection(kind.get(name, "") for name in n.input)
-        assert not sources or n.op_type in {"Relu", *CONVOLUTIONS}
+        assert not sources or n.op_type in {"Clip", "Min", "Relu", *CONVOLUTIONS}
         # A shift stays in front of zeros that a convolution pads with, a factor does not.
         is_scaled = n.op_type in CONVOLUTIONS and kind.get(n.input[0]) in ("Mul", "Div")
         assert not is_scaled

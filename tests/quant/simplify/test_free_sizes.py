@@ -95,6 +95,31 @@ class Shuffled(Gated):
         return image + functional.pixel_shuffle(correction, 2)
 
 
+class Repeated(Shuffled):
+    """Repeats channels and pixels one by one, shrinks to a size, and unshuffles in another
+    order.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tail = nn.Conv2d(2 * FEATURES * 7, 1, 1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Images (N, 1, H, W) to the same."""
+        wide: Tensor = self.wide(image)
+        count, channels, rows, columns = wide.shape
+        sides = (rows // 2, columns // 2)
+        blocks = wide.reshape(count, channels, sides[0], 2, sides[1], 2).permute(0, 3, 5, 1, 2, 4)
+        parts = [
+            functional.interpolate(wide, size=sides, mode="bilinear"),
+            functional.interpolate(wide * 2, scale_factor=0.5),
+            wide.repeat_interleave(2, 1)[:, :channels, ::2, ::2],
+            blocks.reshape(count, 4 * channels, *sides),
+        ]
+        correction: Tensor = self.tail(torch.cat(parts, 1))
+        return image + correction.repeat_interleave(2, 2).repeat_interleave(2, 3)
+
+
 class NoiseLevel(nn.Module):
     """FFDNet's map of one noise level, as a constant."""
 
@@ -145,7 +170,7 @@ def exported(module: nn.Module) -> onnx.ModelProto:
 
 
 @pytest.mark.parametrize(
-    "make", [PaddedUNet, ResizedUNet, Gated, Shuffled, NoiseLevel, UnshuffledNoiseLevel]
+    "make", [PaddedUNet, ResizedUNet, Gated, Shuffled, Repeated, NoiseLevel, UnshuffledNoiseLevel]
 )
 def test_sizes_are_gone_and_results_are_the_same(make: Callable[[], nn.Module]) -> None:
     """Also for sides that are no multiples of 64, as far as the network halves them evenly."""
