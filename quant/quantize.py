@@ -73,6 +73,7 @@ from beers_deploy.quant.passes.residual_groups import (
     GROUP_FRAC_BITS,
     ResidualGroup,
     exceeds_six,
+    finer_members,
     residual_groups,
     single_tensors,
 )
@@ -166,9 +167,13 @@ class Plan:
         return [*stages, *singles]
 
     def core(
-        self, candidate: Graph, frac_bits: Mapping[str, int], earlier: RoundedConvs | None = None
+        self,
+        candidate: Graph,
+        frac_bits: Mapping[str, int],
+        earlier: RoundedConvs | None = None,
+        finer: Mapping[str, int] | None = None,
     ) -> IntCore:
-        """Round a float graph to an integer core.
+        """Round a float graph to an integer core, and return it.
 
         Args:
             candidate: the plan's graph after some passes: equalised, or with copies of its result.
@@ -176,16 +181,14 @@ class Plan:
                 tensor by its name. Equalised tensors get GROUP_FRAC_BITS instead.
             earlier: convolutions that were rounded before, which are not rounded again; new ones
                 are added.
-
-        Returns:
-            The integer core.
+            finer: the fractional bits of equalised tensors that have others.
 
         Raises:
             ModelError: the DPU's shifts do not reach all scales.
         """
         # Equalised tensors are scaled to fill int8 at one scale.
         shared = [*chain.from_iterable(self.groups), *self.singles.tensors]
-        scales = {**frac_bits, **dict.fromkeys(shared, GROUP_FRAC_BITS)}
+        scales = {**frac_bits, **dict.fromkeys(shared, GROUP_FRAC_BITS), **(finer or {})}
         # A coarse copy holds what a finer scale clips.
         scales[CORRECTION] += self.host_part.decoding.finer_bits
         assert set(tensors(candidate)) <= set(scales)  # noqa: S101
@@ -321,7 +324,8 @@ def rounded(plan: Plan, images: Sequence[np.ndarray]) -> tuple[IntCore, Graph]:
     if plan.groups or plan.singles.tensors:
         graph = _equalized(graph, plan, frac_bits, images)
     # 7.
-    return plan.core(graph, frac_bits), graph
+    own = choose_frac_bits(graph, calibration, plan.host_part, False) if plan.groups else {}
+    return plan.core(graph, frac_bits, finer=finer_members(graph, plan.groups, own)), graph
 
 
 def _equalized(

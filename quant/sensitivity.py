@@ -164,7 +164,10 @@ def layer_errors(
         float_values = dict(zip(names, values, strict=True))
         restored = core.host_part.restore(crop, float_values[CORRECTION], scale)
         restored = to_shares(restored, ranges)
-        offset = to_shares(crop, ranges) if core.host_part.adds_image else 0.0
+        # Without a correction the result is the image, which may be added before a pixel shuffle.
+        nothing = 0 * core.host_part.unrounded(float_values[CORRECTION])
+        image = core.host_part.finish(crop, nothing)
+        offset = to_shares(image, ranges) if core.host_part.adds_image else 0.0
         for op, layer in zip(graph, layers, strict=True):
             result = _in_int8(op, core, float_values)
             expected = float_values[op.output]

@@ -7,6 +7,9 @@
 4. Find single tensors: those of no group that convolutions alone write and read.
 
 One scale for a whole group makes its adds exact: nothing has to be aligned, so nothing is rounded.
+Only a tensor of far smaller values has a finer scale. The sums of residual blocks grow, and a
+normalisation behind the first tensor magnifies its steps: with one scale for all, a small GhostNet
+lost 4.6 instead of 1.1 dB (measured).
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,6 +37,9 @@ from beers_deploy.quant.graph.ties import united
 GROUP_FRAC_BITS = 8
 """The fractional bits of a group. Any value would do, because `equalize` scales the group to it."""
 
+
+SPARE_BITS = 2
+"""Unused bits from which on a tensor has a finer scale than its group."""
 
 ResidualGroup = Mapping[str, slice]
 """Tensors that have the same factors, channel by channel, and the slice of the factors that belongs
@@ -174,3 +180,19 @@ def _passes_factors(graph: Graph, group: ResidualGroup) -> bool:
         for op in touching
         if op.output in group and isinstance(op, Conv | Add)
     )
+
+
+def finer_members(
+    graph: Graph, groups: Sequence[ResidualGroup], own: Mapping[str, int]
+) -> dict[str, int]:
+    """Return the fractional bits of the tensors that use far less of int8 than their groups, and
+    that convolutions read.
+
+    Args:
+        graph: the float graph, whose groups are scaled to GROUP_FRAC_BITS.
+        groups: residual groups.
+        own: the fractional bits at which each tensor alone would fill int8 and clip nothing.
+    """
+    read = set(chain.from_iterable(op.inputs for op in graph if isinstance(op, Conv)))
+    members = read.intersection(chain.from_iterable(groups))
+    return {name: own[name] for name in members if own[name] >= GROUP_FRAC_BITS + SPARE_BITS}

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import product
+from unittest.mock import patch
 
 import numpy as np
 import onnx
@@ -45,8 +46,9 @@ from beers_deploy.quant.passes.selection import Passes
 from beers_deploy.quant.passes.trial import Costs
 from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.samples.patches import Patches
-from beers_deploy.quant.session import open_session
+from beers_deploy.quant.session import open_session, result_of
 from tests.quant.quick import image, in_float, quickly
+from tests.quant.simplify.networks import parsed
 
 
 def group_of(graph: Graph) -> ResidualGroup:
@@ -283,3 +285,30 @@ def test_each_step_is_named(float_onnx: onnx.ModelProto, patches: Patches) -> No
         quickly(float_onnx, patches)
     names = [step.what.removeprefix("calibrating: ") for step in reported]
     assert [name.split(" ")[0] for name in names] == ["scale", "float", "equalising"]
+
+
+def test_a_small_tensor_of_a_group_has_a_finer_scale(patches: Patches) -> None:
+    """What is magnified right behind it, as by a normalisation, would magnify its steps."""
+    generator = np.random.default_rng(0)
+    weights = {
+        "head_w": generator.normal(0, 0.1, (4, 1, 3, 3)),
+        "large_w": generator.normal(0, 30, (4, 4, 1, 1)),
+        "last_w": generator.normal(0, 0.01, (1, 4, 1, 1)),
+    }
+    model = parsed(
+        """head = Conv<pads=[1,1,1,1]>(x, head_w) inner = Conv(head, large_w)
+        sum = Add(head, inner) y = Conv(sum, last_w)""",
+        "float[N,1,H,W] x => float[N,1,H,W] y",
+        constants=weights,
+    )
+    finer = quickly(model, patches)
+    with patch("beers_deploy.quant.quantize.finer_members", return_value={}):
+        plain = quickly(model, patches)
+    assert finer.core.frac_bits["head"] > plain.core.frac_bits["head"]
+    shown = image(40, 40)
+    expected = result_of(open_session(model), shown)
+    errors = [
+        np.abs(result_of(open_session(each.host), shown) - expected).mean()
+        for each in (finer, plain)
+    ]
+    assert errors[0] < errors[1] / 2

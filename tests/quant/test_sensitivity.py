@@ -16,8 +16,9 @@ from beers_deploy.quant.passes.selection import Passes
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.sensitivity import Loss, layer_errors, losses
-from beers_deploy.quant.session import few_crops, open_session, run
+from beers_deploy.quant.session import few_crops, open_session, result_of, run
 from tests.quant.quick import patches_of, quickly, without_references
+from tests.quant.simplify.networks import parsed
 
 SPOILT = "body.1.second"
 
@@ -49,6 +50,27 @@ def test_layers_lose_together_what_the_int8_file_loses_and_adds_hardly_anything(
     assert sum(squared_errors.values()) == pytest.approx(together.squared, rel=0.4)
     adds = sum(squared_errors.pop(op.name) for op in quantized.core.ops if isinstance(op, Add))
     assert adds < 0.1 * sum(squared_errors.values())
+
+
+def test_an_image_that_is_added_before_a_pixel_shuffle_is_no_error(
+    crops: list[np.ndarray], patches: Patches
+) -> None:
+    """SESR adds it to each of the four phases, so that the result is larger than the image."""
+    model = parsed(
+        """c = Conv<pads=[1,1,1,1]>(x, w) a = Add(c, x)
+        y = DepthToSpace<blocksize=2, mode="CRD">(a)""",
+        "float[N,1,H,W] x => float[N,1,H2,W2] y",
+        constants={"w": np.random.default_rng(0).normal(0, 0.1, (4, 1, 3, 3))},
+    )
+    int8 = quickly(model, patches)
+    _, together = layer_errors(int8.graph, int8.core, crops)
+    in_float, in_int8 = (open_session(each) for each in (model, int8.host))
+    errors = [
+        abs(result_of(in_int8, crop) - result_of(in_float, crop).clip(0, 1)).mean()
+        for crop in crops
+    ]
+    assert together.mae == pytest.approx(np.mean(errors), rel=1e-3)
+    assert together.sqnr_db > 20
 
 
 @pytest.fixture(scope="module")
