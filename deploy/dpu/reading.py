@@ -259,7 +259,7 @@ def _input_shape(
     """
     with faults_named(where):
         # Without a tile a network is predicted at the sizes that its file states, if it does.
-        require_image(name, sizes, square=all(sizes[2:]) != (tile_px is None))
+        require_image(name, sizes, square=tile_px is not None or not all(sizes[2:]))
     if tile_px is None:
         if not all(sizes[2:]):
             raise ModelError(f"{where} states no size of its input. Give `tile`.")
@@ -272,23 +272,15 @@ def _input_shape(
             f"`tile` must be a multiple of {place_px} px for {where}, got {tile_px} px. Choose "
             "another `tile`."
         )
-    other_sides = {size for size in sizes[2:] if size} - {side}
     if list(sizes[2:]) == [1, 1] and side > 1:
         raise ModelError(
             f"The input {printable(name)} of {where} has one pixel, so it is a parameter and no "
             "image. Export the network with it as a constant."
         )
-    if other_sides:
-        fixed = f"{_side_px(sizes[3], places)} x {_side_px(sizes[2], places)}"
+    if sizes[2] not in (0, side):
+        fixed_px = sizes[2] * place_px - 2 * border_px
         raise ModelError(
-            f"The input of {where} is fixed to {fixed} pixels, but `tile` is {tile_px} px. Give "
-            f"`tile` {_side_px(min(other_sides), places)}, or export the network with free sizes."
+            f"The input of {where} is fixed to {fixed_px} x {fixed_px} pixels, but `tile` is "
+            f"{tile_px} px. Give `tile` {fixed_px}, or export the network with free sizes."
         )
     return (sizes[1], side, side)
-
-
-def _side_px(size: int, places: tuple[int, int]) -> int | str:
-    """Return the side of the image from that of an input in places, or "any" if the file states
-    none.
-    """
-    return size * places[0] - 2 * places[1] if size else "any"
