@@ -3,14 +3,17 @@
 Exporters from TensorFlow transpose the image in front of the first convolution, and the result at
 the end. Linear layers of torch stand between two such nodes.
 
-1. A Transpose to channels last is moved behind operations on each value, concats and products with
-   a matrix, which become convolutions of one pixel. One to channels first then undoes it.
+1. A Transpose to channels last is moved behind operations on each value, concats, padding, means,
+   and products with a matrix, which become convolutions of one pixel. One to channels first then
+   undoes it.
 2. If the image has its channels last, it is treated as one of channels first that is transposed
    before anything else. The result is treated likewise.
 """
 
+from collections.abc import Mapping
 from copy import deepcopy
 
+import numpy as np
 import onnx
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
@@ -81,20 +84,47 @@ def _moved_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
     if _is_transpose(node, TO_FIRST):
         return [Node.new("Identity", sources.values(), result, node.name)]
     first = f"{result}.first"
-    matrix = graph.value(node, 1)
-    is_product = node.op_type == "MatMul" and matrix is not None and matrix.ndim == 2
-    if is_product and matrix is not None:
-        weight = matrix.T[:, :, None, None]
-        moved = graph.convolution(sources[names[0]], first, node.name, weight)
-    elif node.op_type in ON_VALUES or node.op_type == "Concat":
-        inputs = [sources.get(name) or _of_first(graph, name) for name in node.inputs]
-        attributes = dict(node.attributes)
-        if node.op_type == "Concat":
-            attributes["axis"] = TO_LAST[attributes["axis"] % 4]
-        moved = Node.new(node.op_type, inputs, first, node.name, **attributes)
-    else:
+    moved = _on_first(graph, node, sources, first)
+    if moved is None:
         return None
     return [moved, Node.new("Transpose", [first], result, f"{result}.last", perm=TO_LAST)]
+
+
+def _on_first(graph: OnnxGraph, node: Node, sources: Mapping[str, str], first: str) -> Node | None:
+    """Return the same operation on maps that have their channels first; None for one that needs
+    them last.
+
+    Args:
+        graph: the graph that the node belongs to; its constants are extended.
+        node: the operation on maps of channels last.
+        sources: the map of channels first by the name of the map of channels last.
+        first: the name of the result.
+    """
+    kind = node.op_type
+    attributes = dict(node.attributes)
+    source = sources.get(node.inputs[0], "")
+    number = graph.value(node, 1)
+    if kind == "MatMul" and number is not None and number.ndim == 2:
+        return graph.convolution(source, first, node.name, number.T[:, :, None, None])
+    if kind == "Pad" and number is not None:
+        pads = number.reshape(2, 4)[:, TO_FIRST].ravel()
+        name = graph.add_constant(f"{first}.pads", pads, number.dtype)
+        return Node.new(kind, [source, name, *node.inputs[2:3]], first, node.name, **attributes)
+    if kind == "ReduceMean" and attributes.get("keepdims", 1):
+        axes = graph.numbers(node, 1, "axes")
+        moved_axes = [TO_LAST[axis % 4] for axis in axes or ()]
+        inputs = [source]
+        if number is None:
+            attributes["axes"] = moved_axes
+        else:
+            inputs.append(graph.add_constant(f"{first}.axes", np.array(moved_axes), np.int64))
+        return Node.new(kind, inputs, first, node.name, **attributes) if axes else None
+    if kind not in ON_VALUES and kind != "Concat":
+        return None
+    if kind == "Concat":
+        attributes["axis"] = TO_LAST[attributes["axis"] % 4]
+    inputs = [sources.get(name) or _of_first(graph, name) for name in node.inputs]
+    return Node.new(kind, inputs, first, node.name, **attributes)
 
 
 def _of_first(graph: OnnxGraph, name: str) -> str:

@@ -2,10 +2,10 @@
 them.
 
 1. Set the free sizes of the image to numbers, so that the runtime folds arithmetic on shapes.
-2. Write a Resize to a size as one by factors, and what only moves and repeats values as one
-   operator (`rearrangements`). Remove a Pad by nothing, a Slice of the whole map, and an Expand
-   that arithmetic does anyway. Let a convolution repeat a channel, and write a map of one number
-   per channel, such as a noise level.
+2. Write a Resize to a size as one by factors, pads in place of auto_pad SAME, and what only moves
+   and repeats values as one operator (`rearrangements`). Remove a Pad by nothing, a Slice of the
+   whole map, and an Expand that arithmetic does anyway. Let a convolution repeat a channel, and
+   write a map of one number per channel, such as a noise level.
 3. Do both for two sizes. If the networks are equal, the size has no effect, and theirs is the
    network of every image whose sides are multiples of `MULTIPLE_PX`. Otherwise the network is not
    changed.
@@ -25,6 +25,7 @@ from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
 from beers_deploy.quant.simplify.rearrangements import (
     OF_BLOCKS,
     RESHAPING,
+    Sizes,
     is_rearrangement,
     rearranged,
 )
@@ -55,6 +56,7 @@ def free_sizes(model: onnx.ModelProto, fold: Fold) -> onnx.ModelProto:
     graph = OnnxGraph(model)
     if not any(
         is_rearrangement(graph, node)
+        or _leaves_pads(node)
         or (node.op_type in SIZED and (node.op_type != "Concat" or constants & {*node.inputs}))
         for node in graph.nodes
     ):
@@ -107,7 +109,7 @@ def _of_size(model: onnx.ModelProto, rows: int, columns: int, fold: Fold) -> onn
     return fold(network)
 
 
-def _sized(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> list[Node] | None:
+def _sized(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
     """Return the nodes that replace a node whose input has a known size (2).
 
     Args:
@@ -125,12 +127,8 @@ def _sized(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> l
         return rearranged(graph, node, sizes)
     if len(before) != 4 or len(after) != 4 or min(*before, *after) < 1:
         return None
-    if node.op_type == "Resize" and len(node.inputs) == 4:
-        return _by_factors(graph, node, before, after)
-    if node.op_type == "Expand":
-        return _expanded(graph, node, sizes)
-    if node.op_type == "Concat":
-        return _with_written_maps(graph, node, before, after)
+    if node.op_type in SPECIAL:
+        return SPECIAL[node.op_type](graph, node, sizes)
     keeps_all = (
         node.op_type == "Slice"
         and before == after
@@ -142,14 +140,31 @@ def _sized(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> l
     return None
 
 
-def _by_factors(
-    graph: OnnxGraph, node: Node, before: tuple[int, ...], after: tuple[int, ...]
-) -> list[Node] | None:
+def _with_pads(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
+    """Return a strided window with its pads in place of auto_pad SAME; None if it states them."""
+    weight = graph.value(node, 1)
+    _, _, rows, columns = sizes[node.inputs[0]]
+    match = node.window(() if weight is None else weight.shape[2:], (rows, columns))
+    if match is None or not _leaves_pads(node):
+        return None
+    attributes = {**node.attributes, "auto_pad": "NOTSET", "pads": list(match[1].pads)}
+    return [Node.new(node.op_type, node.inputs, node.outputs[0], node.name, **attributes)]
+
+
+def _leaves_pads(node: Node) -> bool:
+    """Return True if the pads of a strided window follow from the size of its map."""
+    return str(node.attributes.get("auto_pad", "")).startswith("SAME") and any(
+        stride > 1 for stride in node.attributes.get("strides", [1])
+    )
+
+
+def _by_factors(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
     """Return a Resize by factors in place of one to a size; None if no whole number divides one of
     the sizes into the other, so that factors may be rounded, and the result have another size.
     """
-    factors = np.divide(after, before)
-    if any(factor % 1 and (1 / factor) % 1 for factor in factors):
+    before = sizes[node.inputs[0]]
+    factors = np.divide(sizes[node.outputs[0]], before)
+    if len(node.inputs) < 4 or any(factor % 1 and (1 / factor) % 1 for factor in factors):
         return None
     scales = graph.add_constant(f"{node.name}.scales", factors)
     attributes = {k: v for k, v in node.attributes.items() if k != "keep_aspect_ratio_policy"}
@@ -160,7 +175,7 @@ def _by_factors(
     return [Node.new("Resize", inputs, node.outputs[0], node.name, **attributes)]
 
 
-def _expanded(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> list[Node] | None:
+def _expanded(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
     """Return nothing but another name for an Expand without effect, or the convolution that repeats
     a map of one channel; None for other Expands.
     """
@@ -175,7 +190,7 @@ def _expanded(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -
     return [graph.convolution(source, result, node.name, np.ones((after[1], 1, 1, 1)))]
 
 
-def _is_broadcast_anyway(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> bool:
+def _is_broadcast_anyway(graph: OnnxGraph, node: Node, sizes: Sizes) -> bool:
     """Return True if all readers of an Expand are arithmetic that broadcasts to the same size."""
     result = node.outputs[0]
     # What another Expand enlarges may be small itself, so it does not count.
@@ -191,21 +206,20 @@ def _is_broadcast_anyway(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[in
     )
 
 
-def _with_written_maps(
-    graph: OnnxGraph, node: Node, before: tuple[int, ...], after: tuple[int, ...]
-) -> list[Node] | None:
+def _with_written_maps(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
     """Return a Concat whose constant maps are written by convolutions with weights of zero.
 
     Args:
         graph: the graph that the node belongs to; its constants are extended.
-        node: the Concat.
-        before: sizes (N, C, H, W) of its first input, which the convolutions read.
-        after: sizes of its result.
+        node: the Concat. The convolutions read its first input.
+        sizes: the sizes of each tensor.
 
     Returns:
         The convolutions and the Concat, None if a constant is no map of one number a channel.
     """
     source = node.inputs[0]
+    before = sizes[source]
+    after = sizes[node.outputs[0]]
     maps = {name: graph.constants[name] for name in node.inputs if name in graph.constants}
     is_map = all(
         value.ndim == 4 and value.shape[2:] == after[2:] and (value == value[..., :1, :1]).all()
@@ -223,3 +237,12 @@ def _with_written_maps(
         nodes.append(graph.convolution(source, names[name], names[name], weight, bias))
     node.inputs = tuple(names.get(name, name) for name in node.inputs)
     return [*nodes, node]
+
+
+SPECIAL: dict[str, Callable[[OnnxGraph, Node, Sizes], list[Node] | None]] = {
+    "Concat": _with_written_maps,
+    "Expand": _expanded,
+    "Resize": _by_factors,
+    **dict.fromkeys(("AveragePool", "Conv", "MaxPool"), _with_pads),
+}
+"""The function for each operator that returns the nodes which replace one."""

@@ -51,6 +51,8 @@ PARTS = (
     "MatMul({}, square)",
     "Concat<axis=-1>({}, u)",
     "Clip({}, , six)",
+    "Pad({}, pads_last)",
+    "ReduceMean<axes=[1,2]>({})",
 )
 """Operators on a tensor of channels last, which stands in the place of the braces."""
 
@@ -68,7 +70,10 @@ def test_channels_that_are_last_between_other_layers_become_first(
         f"{to} = {part.format(x)}" for part, (x, to) in zip(parts, pairwise(tensors), strict=True)
     )
     channels = CHANNELS * (1 + any("Concat" in part for part in parts))
+    # Sizes and channels have to fit what is behind.
     assume(not any("Concat" in part for part in parts[:-1]))
+    is_sized = any(part.startswith(("Pad", "Reduce")) for part in parts)
+    assume(channels == CHANNELS or not is_sized)
     first = f"u = {to_last}(x)"
     sizes = f"[N,{CHANNELS},H,W]"
     if image_last:
@@ -78,6 +83,7 @@ def test_channels_that_are_last_between_other_layers_become_first(
         f"{first} {inner} v = {to_first}({tensors[-1]}) y = Conv(v, end)",
         ends=f"float{sizes} x => float[N,1,H2,W2] y",
         image_last=np.linspace(0.5, 1, CHANNELS),
+        pads_last=[0, 1, 0, 0, 0, 0, 2, 0],
         end=np.ones((1, channels, 1, 1)),
     )
     short = simplify(model, "a.onnx")
@@ -85,6 +91,22 @@ def test_channels_that_are_last_between_other_layers_become_first(
     image = 1 + IMAGE
     before = result_of(open_session(model), np.moveaxis(image, 1, 3) if image_last else image)
     np.testing.assert_allclose(result_of(open_session(short), image), before, rtol=1e-4)
+
+
+def test_pads_that_follow_from_an_even_size_are_stated() -> None:
+    """TensorFlow pads strided layers of images of any size at their end."""
+    where = 'coordinate_transformation_mode="asymmetric", nearest_mode="floor"'
+    same = 'auto_pad="SAME_UPPER", strides=[2,2]'
+    model = made(
+        f"""c = Conv<{same}>(x, w) m = MaxPool<{same}, kernel_shape=[3,3]>(c)
+        y = Resize<{where}>(m, , fourfold)""",
+        fourfold=[1.0, 1.0, 4.0, 4.0],
+    )
+    short = simplify(model, "a.onnx")
+    assert refusal(short) == ""
+    image = IMAGE[..., :16, :20]
+    before = result_of(open_session(model), image)
+    np.testing.assert_allclose(result_of(open_session(short), image), before, rtol=1e-5)
 
 
 @pytest.mark.parametrize("layers", [1, 2, 5])
