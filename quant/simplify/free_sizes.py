@@ -123,7 +123,7 @@ def _sized(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
     source = node.inputs[0] if node.inputs else ""
     before = sizes.get(source, ())
     after = sizes.get(node.outputs[0], ())
-    if node.op_type in RESHAPING and before != after:
+    if node.op_type == "Transpose" or (node.op_type in RESHAPING and before != after):
         return rearranged(graph, node, sizes)
     if len(before) != 4 or len(after) != 4 or min(*before, *after) < 1:
         return None

@@ -1,7 +1,8 @@
 """Write chains of nodes that only move and repeat values as one operator.
 
 Exporters spell shuffles of channels, pixel unshuffles and repeated channels or pixels by Reshape,
-Transpose, Expand and Tile. Such a chain is tested on a map of numbered values:
+Transpose, Expand and Tile, and selected channels by GatherND between two Transposes. Such a chain
+is tested on a map of numbered values:
 
 1. If each channel of the result is a channel of the map, or one place of its blocks of r x r
    pixels, it is a convolution of r x r pixels and stride r that selects them. A pixel unshuffle of
@@ -22,7 +23,7 @@ Sizes = dict[str, tuple[int, ...]]
 
 RESHAPING = {"Flatten", "Reshape", "Squeeze", "Unsqueeze"}
 """Operators that move no value."""
-MOVING = RESHAPING | {"Expand", "Tile", "Transpose"}
+MOVING = RESHAPING | {"Expand", "GatherND", "Tile", "Transpose"}
 PIXEL_SHUFFLES = [0, 1, 4, 2, 5, 3], [0, 3, 4, 1, 5, 2]
 """The transpositions of enlarging pixel shuffles, which stay."""
 OF_BLOCKS = {
@@ -44,15 +45,17 @@ def is_rearrangement(graph: OnnxGraph, node: Node) -> bool:
     """
     perm = node.attributes.get("perm", ())
     is_one = len(perm) > 4 and perm not in PIXEL_SHUFFLES
-    return node.op_type == "Tile" or (is_one and _chain(graph, node)[0] not in graph.inputs)
+    return node.op_type in ("GatherND", "Tile") or (
+        is_one and _chain(graph, node)[0] not in graph.inputs
+    )
 
 
 def rearranged(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
-    """Return the operator that does what a Reshape and the nodes in front of it do.
+    """Return the operator that does what a node and those in front of it do together.
 
     Args:
         graph: the graph that the node belongs to; its constants are extended.
-        node: a Reshape, or another operator that moves no value.
+        node: a Transpose, a Reshape, or another operator that moves no value.
         sizes: the sizes of each tensor, for images of one size.
 
     Returns:
@@ -67,7 +70,7 @@ def rearranged(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
     image = np.arange(math.prod(before)).reshape(before)
     moved = image
     for each in chain:
-        moved = _moved(moved, each, sizes[each.outputs[0]])
+        moved = _moved(graph, moved, each, sizes[each.outputs[0]])
     if after[2] > before[2]:
         return _enlarged(graph, node, source, image, moved)
     block = before[2] // after[2]
@@ -110,7 +113,7 @@ def _chain(graph: OnnxGraph, node: Node) -> tuple[str, list[Node]]:
     return chain[0].inputs[0], chain
 
 
-def _moved(values: np.ndarray, node: Node, size: tuple[int, ...]) -> np.ndarray:
+def _moved(graph: OnnxGraph, values: np.ndarray, node: Node, size: tuple[int, ...]) -> np.ndarray:
     """Return the result of a node of this size."""
     if node.op_type == "Transpose":
         return values.transpose(node.attributes.get("perm"))
@@ -118,4 +121,9 @@ def _moved(values: np.ndarray, node: Node, size: tuple[int, ...]) -> np.ndarray:
         return np.broadcast_to(values, size)
     if node.op_type == "Tile":
         return np.tile(values, np.floor_divide(size, values.shape))
+    if node.op_type == "GatherND":
+        chosen = graph.value(node, 1)
+        is_of_first_axis = chosen is not None and chosen.ndim == 2 and chosen.shape[1] == 1
+        # A number that no map has.
+        return values[chosen[:, 0]] if is_of_first_axis else np.full(size, -1)  # type: ignore[index]
     return values.reshape(size)

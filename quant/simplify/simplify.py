@@ -269,6 +269,10 @@ def _of_our_opset(model: onnx.ModelProto) -> onnx.ModelProto:
         return model
     if version < RESIZE_HAS_MODES:
         _place_corners(converted)
+    for node in converted.graph.node:
+        # The converter leaves it, though the operator of our opset has no such attribute.
+        if node.op_type == "ReduceMean":
+            _replace(node.attribute, [a for a in node.attribute if "noop" not in a.name])
     return converted
 
 

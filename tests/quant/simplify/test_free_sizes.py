@@ -4,6 +4,7 @@ import io
 import warnings
 from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -197,6 +198,37 @@ class Enlarged(nn.Module):
         wide = self.body(image).expand(-1, 3, -1, -1)
         result: Tensor = wide * (1 - self.body(wide[:, :1])).expand_as(wide)
         return result.expand(image.shape[0], 3, image.shape[2], image.shape[3])
+
+
+class Selected(nn.Module):
+    """Reverses channels, and scales them by their mean over the image."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.wide = nn.Conv2d(1, FEATURES, 3, padding=1)
+        self.tail = nn.Conv2d(FEATURES, 1, 3, padding=1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Images (1, 1, H, W) to the same."""
+        wide: Tensor = self.wide(image)[:, [3, 1, 0, 2]]
+        mean = functional.interpolate(wide.mean((2, 3), keepdim=True), wide.shape[2:])
+        result: Tensor = self.tail(wide * mean)
+        return result
+
+
+def test_torchs_newer_exporter_selects_channels_in_another_way(tmp_path: Path) -> None:
+    """It writes GatherND between two Transposes, and a mean that onnx converts incompletely."""
+    image = torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            Selected().eval(), (image,), tmp_path / "a.onnx", dynamo=True, verbose=False
+        )
+    model = onnx.load_model(tmp_path / "a.onnx")
+    short = simplify(model, "a.onnx")
+    assert refusal(short) == ""
+    before, after = (result_of(open_session(each), image.numpy()) for each in (model, short))
+    np.testing.assert_allclose(after, before, atol=1e-5)
 
 
 def test_an_expand_that_has_an_effect_keeps_it() -> None:
