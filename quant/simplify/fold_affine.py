@@ -43,7 +43,8 @@ class Affine:
 
 
 def add_negated(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a - b by a + (-b), so that the factor -1 can be folded (point 1 of the module).
+    """Replace a - b by a + (-b), where the convolution that computes b is negated, or a product by
+    -1 is new (point 1 of the module).
 
     Args:
         shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
@@ -51,12 +52,17 @@ def add_negated(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | No
         node: any node.
 
     Returns:
-        The product by -1 and the Add; None if the node is no Sub of two float maps.
+        The Add, behind a product where that is new; None if the node is no Sub of two float maps.
     """
     is_of_maps = graph.constants.keys().isdisjoint(node.inputs)
     if node.op_type != "Sub" or not is_of_maps or node.inputs[1] not in shapes:
         return None
     result = node.outputs[0]
+    before = graph.sole_writer(node.inputs[1])
+    if before is not None and is_convolution(graph, before):
+        # At once, so that the tensor keeps its name.
+        _fold(graph, before, Affine(-np.ones(1), np.zeros(1)), into_results=True)
+        return [Node.new("Add", node.inputs, result, node.proto.name)]
     name = f"{result}.negated"
     factor = graph.add_constant(f"{name}.factor", np.array(-1))
     return [
