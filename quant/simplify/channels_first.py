@@ -82,7 +82,7 @@ def _moved_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
         return None
     (result,) = node.outputs
     if _is_transpose(node, TO_FIRST):
-        return [Node.new("Identity", sources.values(), result, node.name)]
+        return [Node.new("Identity", [*sources.values()], result, node.name)]
     first = f"{result}.first"
     moved = _on_first(graph, node, sources, first)
     if moved is None:

@@ -50,6 +50,14 @@ def convolve_slice(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] |
             strides[axis - 2] = cut.step
         else:
             return None
-    weight = np.tile(np.outer(*taps), (size[1], 1, 1, 1))
-    how = {"dilations": dilations, "strides": strides, "group": size[1]}
-    return [graph.convolution(node.inputs[0], node.outputs[0], node.name, weight, **how)]
+    weight = np.tile(np.outer(taps[0], taps[1]), (size[1], 1, 1, 1))
+    conv = graph.convolution(
+        node.inputs[0],
+        node.outputs[0],
+        node.name,
+        weight,
+        dilations=dilations,
+        strides=strides,
+        group=size[1],
+    )
+    return [conv]
