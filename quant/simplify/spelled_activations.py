@@ -49,7 +49,9 @@ def join_clips(graph: OnnxGraph, node: Node) -> list[Node] | None:
         return [Node.new("Relu", [source], result, node.name)]
     readers = {reader.op_type for reader in graph.readers[result]}
     is_last = result in graph.outputs or "DepthToSpace" in readers
-    if is_last or not -np.inf < low < high < np.inf:
+    # A bank of filters for a sensor is mirrored, and is quantised from its weights.
+    is_bank = any(other.op_type == "Pad" for other in graph.nodes)
+    if is_last or is_bank or not -np.inf < low < high < np.inf:
         return None
     unit = (high - low) / 6
 
