@@ -160,8 +160,9 @@ def consistency_facts(network: Network, sensor: Sensor) -> Facts | None:
 
     Returns:
         The weights for pixels in [0, 1] of full scale, by the names that `host.py` reads. None if
-        the sensor is the unknown one, or if the network changes the image size or the bands or
-        reads another range than [0, 1]; `restore` omits the step then too.
+        the sensor is the unknown one, or if the network changes the image size or the bands;
+        `restore` omits the step then too. None also if the network reads another range than [0, 1]:
+        `host.py` has the pixels in that range, `restore` in digital numbers.
     """
     tiling = network.tiling
     if sensor.name == BLIND or not keeps_pixels(tiling) or network.input_ranges:

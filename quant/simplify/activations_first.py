@@ -100,8 +100,9 @@ def _lacks_convolution(graph: OnnxGraph, node: Node) -> bool:
     readers = {reader.op_type for reader in graph.readers[node.outputs[0]]}
     if node.op_type == "DepthToSpace" and readers <= HOST:
         return False
-    is_sum = before.op_type != "Add" or graph.constants.keys().isdisjoint(before.inputs)
-    return before.op_type not in MAY_FOLLOW[node.op_type] or not is_sum
+    # The sum with a constant becomes part of the convolution.
+    adds_constant = before.op_type == "Add" and not graph.constants.keys().isdisjoint(before.inputs)
+    return before.op_type not in MAY_FOLLOW[node.op_type] or adds_constant
 
 
 def _any_moves(graph: OnnxGraph) -> bool:
