@@ -134,13 +134,14 @@ def restore_file(
         # All rows are finished: a stop now would save nothing.
         with held_back():
             interval = _write_interval(widths, output, work, checkpoint, bands)
-            about = what_was_done(work.networks, work.scale)
-            write_output(checkpoint, work.source, output, about)
             listed = found_list_path(out, reading.fix_detectors)
             if listed is not None:
                 write_text(listed, faults.text)
             if output.self_check is not None:
                 write_map(output.self_check, blocks, stored.raster)
+            # Last, because the finished rows are removed then: what fails before can be resumed.
+            about = what_was_done(work.networks, work.scale)
+            write_output(checkpoint, work.source, output, about)
     # The two checks are no part of a restoration, and their times are figures of their own.
     time_s = time.perf_counter() - started - work.check_s - self_check_s
     _warn_of_clipping(work, checkpoint)

@@ -12,9 +12,10 @@ from numpy.testing import assert_array_equal
 
 import beers_deploy as bd
 from beers_deploy.model.self_check import BLOCK_PX, MOST_CHI2
-from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.errors import ImageError, MachineError, OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.restoration import run as run_module
 from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import NAME, TRANSFORM, names, two_bands
 
@@ -92,6 +93,25 @@ def test_a_network_for_another_sensor_is_found(
     with pytest.raises(ImageError, match=r"of .* fails the self-check: .* contradict the raw"):
         run(image, strict, network=other_network, strict=True, self_check=tmp_path / "map.tif")
     assert names(tmp_path) == ["out.tif"]
+
+
+def test_a_map_that_cannot_be_written_leaves_the_old_image_and_a_run_to_resume(
+    image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise MachineError("No space left on device.")
+
+    out = tmp_path / "out.tif"
+    out.write_bytes(b"old")
+    options: dict[str, Any] = {"network": "convbeers-xs", "self_check": tmp_path / "map.tif"}
+    monkeypatch.setattr(run_module, "write_map", full)
+    with pytest.raises(MachineError, match="No space left"):
+        run(image, out, **options)
+    assert out.read_bytes() == b"old"
+    monkeypatch.undo()
+    # No pixel is left to restore.
+    assert run(image, out, resume=True, **options).figures["throughput"].value == 0
+    assert out.read_bytes() != b"old"
 
 
 def test_the_traditional_pipeline_is_checked_too(image: Path, tmp_path: Path) -> None:
