@@ -86,7 +86,8 @@ def stress(
     from beers_deploy.studies.stress.battery import battery_table, chosen
     from beers_deploy.studies.stress.bit_flips import flip_curves_svg, flip_table
     from beers_deploy.studies.stress.cases import CASES
-    from beers_deploy.studies.stress.networks import STAGES, open_subject
+    from beers_deploy.studies.stress.networks import open_subject
+    from beers_deploy.studies.stress.stages import STAGES
 
     names = chosen(cases, [case.name for case in CASES], "cases")
     stage_names = chosen(stages, STAGES, "stages")

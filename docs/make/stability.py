@@ -20,7 +20,8 @@ from beers_deploy.studies.stress.battery import (
 )
 from beers_deploy.studies.stress.cases import CASES
 from beers_deploy.studies.stress.checks import LIMITATIONS
-from beers_deploy.studies.stress.networks import STAGES, Subject, open_subject
+from beers_deploy.studies.stress.networks import Subject, open_subject
+from beers_deploy.studies.stress.stages import STAGES
 
 TARGET = Path(__file__).parents[1] / "explanation" / "stability.md"
 OPENING = f"""# Stability

@@ -18,7 +18,8 @@ from beers_deploy.restoration.tiles.rows import restore_floats
 from beers_deploy.studies.stress.battery import StageResult, run_battery, worst
 from beers_deploy.studies.stress.cases import CASES, FULL_DN, Case
 from beers_deploy.studies.stress.checks import LIMITATIONS, Measure, differing, local_range, ringing
-from beers_deploy.studies.stress.networks import STAGES, Subject, open_subject
+from beers_deploy.studies.stress.networks import Subject, open_subject
+from beers_deploy.studies.stress.stages import STAGES
 from docs.make import stability as maker
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid

@@ -16,7 +16,8 @@ from beers_deploy.quant.integer.reference import INT32_BITS
 from beers_deploy.results import Table
 from beers_deploy.studies.stress.cases import CASES, SIDE_PX, Case
 from beers_deploy.studies.stress.checks import Limitation, Measure, limitation_of
-from beers_deploy.studies.stress.networks import STAGES, Subject
+from beers_deploy.studies.stress.networks import Subject
+from beers_deploy.studies.stress.stages import STAGES
 
 
 @dataclass(frozen=True)
