@@ -7,17 +7,25 @@ is restored. The same command, resumed or not, therefore replaces the same pixel
 
 import logging
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from beers_deploy.model.metrics.detector_lines import constant_columns
 from beers_deploy.model.metrics.detector_pixels import PATCH_PX, wrong_pixels
 from beers_deploy.model.metrics.detector_stripes import Stripes
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.source import Source, strips
-from beers_deploy.profiles.errors import ImageError
-from beers_deploy.restoration.detectors.fault_list import FOUND, Fault, FaultList, read_list
+from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.restoration.detectors.fault_list import (
+    FOUND,
+    Fault,
+    FaultList,
+    counted,
+    read_list,
+)
 from beers_deploy.restoration.detectors.look import as_floats, look_at_detectors, value_steps
 
 logger = logging.getLogger(__name__)
@@ -67,9 +75,45 @@ def faults_of(source: Source, source_name: str, name: str) -> FaultList:
         if source_name == FOUND
         else read_list(Path(source_name), source.raster)
     )
+    require_neighbours(faults, source.raster)
     origin = "found" if source_name == FOUND else "listed"
     logger.info("faulty detectors: %s %s, to be interpolated", faults.words, origin)
     return faults
+
+
+def require_neighbours(faults: FaultList, raster: Raster) -> None:
+    """Warn of faulty columns and rows that stay as they are, without a valid one in reach.
+
+    Args:
+        faults: the faults to replace.
+        raster: the description of the image.
+
+    Raises:
+        OptionError: all columns or all rows of a band are faulty.
+    """
+    sizes_px = {"column": raster.width_px, "row": raster.height_px}
+    for band, (name, size_px) in product(range(1, raster.bands + 1), sizes_px.items()):
+        along = "row" if name == "column" else "column"
+        places = [
+            getattr(fault, name)
+            for fault in faults.faults
+            if getattr(fault, along) < 0 and fault.band in (0, band)
+        ]
+        valid = np.ones(size_px, bool)
+        valid[np.array(places, int)] = False
+        if not valid.any():
+            raise OptionError(
+                f"`fix_detectors` has all of {counted(size_px, name)} as faulty, so no pixel is "
+                "left to interpolate from. List the faulty ones alone."
+            )
+        reached = binary_dilation(valid, np.ones(2 * REACH_PX + 1))
+        if stay := int(np.count_nonzero(~reached)):
+            logger.warning(
+                "look at the detectors: %s without a valid one within %d px, left as they are: "
+                "mark these pixels as nodata",
+                counted(stay, f"faulty {name}"),
+                REACH_PX,
+            )
 
 
 def fixed(source: Source, faults: FaultList) -> Source:

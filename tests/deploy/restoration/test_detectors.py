@@ -16,7 +16,12 @@ from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.source import ArraySource, strips
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.restoration.detectors.fault_list import Fault, FaultList, read_list
-from beers_deploy.restoration.detectors.fix import REACH_PX, FixedSource, find_faults
+from beers_deploy.restoration.detectors.fix import (
+    REACH_PX,
+    FixedSource,
+    find_faults,
+    require_neighbours,
+)
 from beers_deploy.restoration.detectors.look import LOOKED_PX, look_at_detectors, sentences
 from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import done
@@ -274,3 +279,18 @@ def test_a_stopped_run_goes_on_with_the_same_faults(
     run(image, out, fix_detectors="found", resume=True)
     assert out.read_bytes() == (tmp_path / "expected.tif").read_bytes()
     assert (tmp_path / "out.detectors.csv").exists()
+
+
+def test_columns_without_a_valid_one_in_reach_are_counted_and_all_of_them_refused(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    raster = source_of(ground(20, WIDTH)).raster
+    wide = [Fault(column, -1) for column in range(2 * REACH_PX + 3)]
+    require_neighbours(FaultList(tuple(wide[3:])), raster)
+    assert not caplog.records
+    require_neighbours(FaultList(tuple(wide)), raster)
+    # On the left there is no valid column at all.
+    assert f"{REACH_PX + 3} faulty columns without" in caplog.text
+    every = tuple(Fault(column, -1) for column in range(WIDTH))
+    with pytest.raises(OptionError, match=f"all of {WIDTH} columns as faulty"):
+        require_neighbours(FaultList(every), raster)
