@@ -60,6 +60,9 @@ def busiest_windows(dn: np.ndarray, side_px: int) -> list[tuple[int, int]]:
 
 def _busiest(dn: np.ndarray, side_px: int) -> tuple[int, int]:
     gradient = np.abs(np.diff(dn, axis=0))[:, :-1] + np.abs(np.diff(dn, axis=1))[:-1]
+    # An image one pixel high or wide has no gradient, and one window.
+    if not gradient.size:
+        return 0, 0
     rows, columns = (
         range(0, max(size - side_px, 0) + 1, max(side_px // 2, 1)) for size in dn.shape
     )

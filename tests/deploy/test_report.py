@@ -2,6 +2,7 @@ import re
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from beers_deploy.model.io.pictures import busiest_windows, picture_url, stretch_of, strip
 from beers_deploy.profiles.figures import Row, measured, predicted, unavailable
@@ -36,6 +37,12 @@ def test_the_page_asks_the_network_for_nothing() -> None:
     page = render(report())
     for word in ("http://", "https://", 'src="/', "<script", "@import", "url("):
         assert word not in page
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("shape", [(1, 1), (1, 90), (30, 1), (2, 2)])
+def test_an_image_without_a_gradient_has_one_window(shape: tuple[int, int]) -> None:
+    assert busiest_windows(np.ones(shape), 20) == [(0, 0)]
 
 
 def test_the_busiest_window_lies_on_the_texture() -> None:
