@@ -25,6 +25,7 @@ def characterize(
     bits: Annotated[int, Interval(ge=1, le=16)] | None = None,
     gain: float | None = None,
     gsd: float | None = None,
+    overwrite: bool = False,
     progress: Progress = None,
 ) -> "MeasuredSensor":
     """Measure the MTF and the noise of a sensor on its raw images, and write its profile.
@@ -44,6 +45,7 @@ def characterize(
         bits: bits of a pixel; found from clipped pixels if none.
         gain: DN per W/m2/sr/um; full scale is assumed to be 400 W/m2/sr/um if none.
         gsd: ground sampling distance in m; no pixel depends on it.
+        overwrite: replace the profile if it exists.
         progress: a function that is called at each step, False for silence, None for a bar or lines
             on standard error.
 
@@ -52,7 +54,8 @@ def characterize(
 
     Raises:
         ImageError: images that are not raw, or that lack what is needed.
-        OptionError: an option that contradicts the pixels, or `out` is no .toml file.
+        OptionError: an option that contradicts the pixels, or an `out` that exists or
+            is no .toml file.
 
     Examples:
         >>> raw = bd.simulate(size=256, seed=1).degraded
@@ -66,6 +69,10 @@ def characterize(
     file = path_or_none(out)
     if file is not None and file.suffix != ".toml":
         raise OptionError(f"`out` must end in .toml, as sensor profiles do, got {file}.")
+    if file is not None and file.exists() and not overwrite:
+        raise OptionError(
+            f"{file} exists already. Add `overwrite` to replace it, or choose another name."
+        )
     edges = [edge] if isinstance(edge, str) else list(edge)
     refuse_with("`mtf`", edge=mtf is not None and bool(edges))
     stated = Stated(bits, gain, gsd, black_level, None if mtf is None else contrasts(mtf))

@@ -135,7 +135,7 @@ def test_without_an_edge_the_mtf_is_assumed_and_said_so(tmp_path: Path) -> None:
     profile = Sensor.load(str(out))
     assert profile.mtf_nyquist.status == "assumed"
     assert profile.snr_pair[1].status == "measured"
-    assert "assumption" not in done(*command, "--mtf", "0.08,0.04")
+    assert "assumption" not in done(*command, "--mtf", "0.08,0.04", "--overwrite")
     profile = Sensor.load(str(out))
     assert profile.nominal().mtf_axes == (0.08, 0.04)
     assert profile.mtf_nyquist.status == "stated"
@@ -249,6 +249,15 @@ def test_a_profile_that_no_command_reads_is_not_written(tmp_path: Path) -> None:
     message = refused("characterize", image, "--bits", 12, "--out", tmp_path / "mine.txt")
     assert "must end in .toml" in message
     assert [*tmp_path.iterdir()] == [image]
+
+
+def test_a_profile_that_exists_is_replaced_only_if_asked(tmp_path: Path) -> None:
+    edited = tmp_path / "mine.toml"
+    edited.write_text("edited by hand")
+    image = tiff(tmp_path, RAW)
+    message = refused("characterize", image, "--bits", 12, "--mtf", 0.1, "--out", edited)
+    assert "mine.toml exists already. Add --overwrite" in message
+    assert edited.read_text() == "edited by hand"
 
 
 def test_one_image_twice_or_images_of_two_gains_are_refused(
