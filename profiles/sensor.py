@@ -181,6 +181,11 @@ class Sensor:
         """
         if isinstance(sensor, Sensor):
             return sensor
+        if not isinstance(sensor, str | os.PathLike):
+            raise ProfileError(
+                f"A sensor must be a Sensor, a name or the path of a .toml file, got "
+                f"{type(sensor).__name__}. 'beers-deploy profiles' lists the names."
+            )
         name = os.fspath(sensor)
         source = BLIND_PROFILE if name == BLIND else name
         label, raw = read_toml("sensors", source)

@@ -1,6 +1,7 @@
 """`restore`: a raw image in, the restored one out, of any size."""
 
 import os
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -179,7 +180,7 @@ def restore(
         strict=strict,
         force=force,
         # A budget of 0 bytes would count as none.
-        memory_bytes=None if memory is None else max(int(memory * 1e9), 1),
+        memory_bytes=None if memory is None else max(int(min(memory * 1e9, sys.maxsize)), 1),
         fix_detectors=fix_detectors or "",
     )
     engine = Engine(runtime, threads, scheduler)

@@ -14,7 +14,7 @@ from typing import Any, Literal, ParamSpec, TypeVar, cast, get_args, get_origin
 
 from annotated_types import Interval
 
-from beers_deploy.profiles.errors import BeersError, OptionError, missing_extra
+from beers_deploy.profiles.errors import BeersError, OptionError, missing_extra, printable
 from beers_deploy.verbs.parameters import Beside, Holds, InputPath, Labelled, Written
 
 P = ParamSpec("P")
@@ -28,8 +28,8 @@ def verb(function: Callable[P, R]) -> Callable[P, R]:
     """Check the parameters of a function before it runs, and record them in its result.
 
     1. An older verdict is deleted, so that it does not pass for that of a run that is refused.
-    2. A value outside the interval or the choices of its annotation is refused, and so is an empty
-       text, such as that of an unset variable.
+    2. A value outside the type, the interval or the choices of its annotation is refused, and so
+       is an empty text, such as that of an unset variable.
     3. An output that is an input or another output is refused.
     4. The parameter `progress` decides how the work inside is reported.
     5. If an optional package is missing, the error names the extra that installs it.
@@ -76,7 +76,7 @@ def require_allowed(parameter: Parameter, value: object) -> None:
     """Raise OptionError if the annotation of a parameter does not allow its value.
 
     Args:
-        parameter: annotated with an `Interval` or a `Literal`, or with neither.
+        parameter: annotated with its type, and perhaps with an `Interval` or a `Literal`.
         value: what was given; None and the default are always allowed.
     """
     name = parameter.name
@@ -84,12 +84,36 @@ def require_allowed(parameter: Parameter, value: object) -> None:
         raise OptionError(f"`{name}` is empty. Give a value, or leave it out.")
     if value is None or value is parameter.default:
         return
-    for part in parts_of(parameter.annotation):
+    parts = list(parts_of(parameter.annotation))
+    _require_type(name, value, parts)
+    for part in parts:
         if isinstance(part, Interval) and isinstance(value, int | float):
             _require_inside(name, value, part)
         if get_origin(part) is Literal and value not in get_args(part):
             names = ", ".join(map(repr, get_args(part)))
             raise OptionError(f"`{name}` must be one of {names}, got {value!r}.")
+
+
+def _require_type(name: str, value: object, parts: list[Any]) -> None:
+    """Raise OptionError if a switch is given as text, or if a number is no number of its type."""
+    got = printable(repr(value))
+    # The text "no" would count as True.
+    if bool in parts and isinstance(value, str):
+        raise OptionError(f"`{name}` must be True or False, got {got}.")
+    if not {int, float}.intersection(parts):
+        return
+    number = math.nan
+    # float() would read text, and would count True as 1.
+    is_number = not isinstance(value, str | bool)
+    if is_number:
+        try:
+            number = float(cast(float, value))
+        except (TypeError, ValueError, OverflowError):
+            is_number = False
+    if not is_number:
+        raise OptionError(f"`{name}` must be one number, got {got}.")
+    if float not in parts and not number.is_integer():
+        raise OptionError(f"`{name}` must be an integer, got {got}.")
 
 
 def _require_inside(name: str, value: float, interval: Interval) -> None:

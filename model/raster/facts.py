@@ -1,5 +1,6 @@
 """Describe an image before its pixels are read: size, type, missing pixels, and place."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
@@ -284,12 +285,15 @@ def require_small_offset(name: str, offset: float, scale: float) -> None:
 
 
 def usable_nodata(value: float | None, dtype: np.dtype[Any]) -> float | None:
-    """Return the nodata value of an image, or None if its pixels are integers without it."""
-    if value is None or dtype.kind == "f":
-        return value
-    limits = np.iinfo(dtype)
+    """Return the nodata value of an image, or None if the type of its pixels cannot hold it."""
+    if value is None:
+        return None
     # A value that no pixel can have marks none, so the image is as good without it.
-    fits = float(value).is_integer() and limits.min <= value <= limits.max
+    if dtype.kind == "f":
+        fits = not math.isfinite(value) or abs(value) <= float(np.finfo(dtype).max)
+    else:
+        limits = np.iinfo(dtype)
+        fits = float(value).is_integer() and limits.min <= value <= limits.max
     return value if fits else None
 
 

@@ -1,13 +1,18 @@
 """Every option of every verb is described, and refused where it would have no effect."""
 
+import re
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from beers_deploy.cli.commands import COMMANDS, app
+from beers_deploy.profiles.errors import BeersError
+from beers_deploy.verbs.restore import restore
 from tests.deploy.verb_parameters import existing, options
 
 
@@ -155,3 +160,35 @@ def test_a_combination_is_refused(
     assert any(word in sentence for word in others), (command, sentence)
     assert result.stderr.count("\n") == 1, result.stderr
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ({"full_scale": "4095"}, "`full_scale` must be one number, got '4095'"),
+        ({"nodata": "x"}, "`nodata` must be one number, got 'x'"),
+        ({"full_scale": [4095]}, "`full_scale` must be one number"),
+        ({"full_scale": 10**400}, "`full_scale` must be one number"),
+        ({"full_scale": 1e300}, "`full_scale` must be an integer of 1 to 65535"),
+        ({"threads": 1.5}, "`threads` must be an integer, got 1.5"),
+        ({"tile": True}, "`tile` must be one number, got True"),
+        ({"strict": "no"}, "`strict` must be True or False, got 'no'"),
+        ({"sensor": 5}, "A sensor must be a Sensor, a name or the path"),
+    ],
+    ids=str,
+)
+def test_a_value_of_another_type_is_refused_in_one_sentence(
+    value: dict[str, object], words: str
+) -> None:
+    with pytest.raises(BeersError, match=re.escape(words)):
+        restore(np.full((20, 30), 900, np.uint16), network="convbeers-xs", **value)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", [np.uint16, np.float32])
+def test_a_number_beyond_the_pixels_or_the_machine_limits_nothing(kind: type) -> None:
+    image: np.ndarray = np.full((20, 30), 900, kind)
+    expected = restore(image, network="convbeers-xs")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        result = restore(image, network="convbeers-xs", nodata=1e300, memory=1e300)
+    np.testing.assert_array_equal(result, expected)
