@@ -66,9 +66,10 @@ def restore(
 ) -> Any:
     """Restore an image of raw digital numbers tile by tile, as if it were restored whole.
 
-    A file is read and written by rows, so memory does not grow with its height. OUT has the pixel
-    type and the scale of IMAGE, and keeps its georeference, RPCs, missing pixels and alpha. Bands
-    are restored one by one. A warning says where noise, edges or detectors contradict the sensor.
+    A file is read and written by rows, so memory does not grow with its height. OUT has the scale
+    and the pixel type of IMAGE (float32 for floats), and keeps its georeference, RPCs, missing
+    pixels and alpha. Bands are restored one by one. A warning says where noise, edges or detectors
+    contradict the sensor.
 
     Args:
         image: image file of any size: TIFF, or what GDAL reads. In Python also an array (H, W) or
@@ -146,27 +147,13 @@ def restore(
     from beers_deploy.restoration.runtime import Engine
     from beers_deploy.restoration.steps import Around
 
-    if method == "traditional":
-        refuse_with(
-            "`method` traditional",
-            **options("network", "tile", "halo", "resume", "runtime", "threads", "scheduler"),
-            **options("consistency", "exposure", "dry_run", "interval"),
-        )
-    else:
-        refuse_without("`method` traditional", **options("quality"))
     path = _file_of(image)
-    if path is None:
-        refuse_with(
-            "an array",
-            **options("out", "compression", "cog", "stac", "self_check", "view", "resume"),
-            **options("overwrite", "dry_run", "fix_detectors", "scheduler"),
-        )
-    else:
-        refuse_with("an image file, which states its own", **options("nodata"))
-        refuse_without("`cog`", stac=stac is not None and not cog)
+    _refuse_without_effect(options, method, path, dry_run and out is None)
+    if path is not None:
         require_image_file(path)
     output = None
-    if path is not None and not dry_run:
+    # A dry run refuses the outputs that the run would refuse.
+    if path is not None and not (dry_run and out is None):
         how: dict[str, Any] = {"compression": compression, "cog": cog, "resume": resume}
         how["interval"] = interval
         how["self_check"] = path_or_none(self_check)
@@ -196,7 +183,7 @@ def restore(
     load = _traditional(quality, unknown) if method == "traditional" else network_pipeline
     if path is None:
         return restore_array(image, reading, load, interval)
-    if output is None:
+    if output is None or dry_run:
         return _preview(path, network_pipeline(), reading)
     run = restore_file(path, output, reading, load)
     _write_documents(path, run, output, stac, view, force)
@@ -210,6 +197,43 @@ def _file_of(image: Any) -> Path | None:
     # A dataset of rasterio has a coordinate system and the name of its file. A DataArray may have
     # the attribute `crs` too, but it has no method `read`.
     return Path(image.name) if hasattr(image, "crs") and hasattr(image, "read") else None
+
+
+def _refuse_without_effect(
+    options: Callable[..., dict[str, bool]], method: str, path: Path | None, writes_none: bool
+) -> None:
+    """Raise OptionError if an option is given that has no effect.
+
+    Args:
+        options: returns whether parameters have another value than their default.
+        method: the parameter `method`.
+        path: of the image, None of an array.
+        writes_none: whether the run is a dry one that names no output.
+    """
+    if method == "traditional":
+        refuse_with(
+            "`method` traditional",
+            **options("network", "tile", "halo", "resume", "runtime", "threads", "scheduler"),
+            **options("consistency", "exposure", "dry_run", "interval"),
+        )
+    else:
+        refuse_without("`method` traditional", **options("quality"))
+    if path is None:
+        refuse_with(
+            "an array",
+            **options("out", "compression", "cog", "stac", "self_check", "view", "resume"),
+            **options("overwrite", "dry_run", "fix_detectors", "scheduler"),
+        )
+        return
+    refuse_with("an image file, which states its own", **options("nodata"))
+    if not options("cog")["cog"]:
+        refuse_without("`cog`", **options("stac"))
+    if writes_none:
+        refuse_without(
+            "`out`",
+            **options("compression", "cog", "stac", "self_check", "interval", "view"),
+            **options("resume", "overwrite"),
+        )
 
 
 def _traditional(quality: str, unknown: bool) -> "Callable[[], Pipeline]":
@@ -243,7 +267,7 @@ def _output(
     """
     from beers_deploy.restoration.detectors.fault_list import found_list_path
     from beers_deploy.restoration.interval import interval_beside
-    from beers_deploy.restoration.output import Output
+    from beers_deploy.restoration.output import Output, require_tiff_name
     from beers_deploy.restoration.stac import network_paths
 
     if out is None:
@@ -251,6 +275,7 @@ def _output(
             "`out` is missing. Name the TIFF to write, or add `dry_run` to see the plan only."
         )
     path = Path(out)
+    require_tiff_name(path)
     widths = None if how["interval"] is None else interval_beside(path)
     named = [path_or_none(document) for document in documents]
     if named[0] is not None:

@@ -101,6 +101,7 @@ REFUSED = {
         ),
         Refused(("quality",), without="--method"),
         Refused(("stac",), without="--cog"),
+        Refused(("compression", "cog", "view", "resume", "overwrite"), "--dry-run", without="OUT"),
     ],
     "evaluate": [
         Refused(("images", "sweep", "brightness"), "--pairs PAIRS"),

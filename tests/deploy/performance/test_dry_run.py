@@ -98,3 +98,13 @@ def test_it_reads_none_of_a_file_of_ten_gigabytes(model: Path, tmp_path: Path) -
     (row,) = json.loads(out.read_text())["rows"]
     assert row["figures"]["width"]["value"] == 73_000
     assert [entry["name"] for entry in json.loads(out.read_text())["inputs"]] == [model.name]
+
+
+@pytest.mark.parametrize("name", ["old.tif", "out.png"])
+def test_an_output_that_the_run_refuses_is_refused_in_the_same_words(
+    name: str, model: Path, tmp_path: Path
+) -> None:
+    tifffile.imwrite(tmp_path / "raw.tif", np.full((20, 30), 900, np.uint16))
+    (tmp_path / "old.tif").write_bytes(b"old")
+    command = f"restore {tmp_path}/raw.tif {tmp_path / name} --network {model} --quiet"
+    assert done(f"{command} --dry-run", code=2) == done(command, code=2)
