@@ -2,7 +2,7 @@
 
 import logging
 import math
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.verbs.parameters import Edges, Images, Interval, Mtf, Progress, RequiredFile
@@ -83,11 +83,12 @@ def characterize(
     return sensor
 
 
-def contrasts(mtf: str | tuple[float, float]) -> tuple[float, float]:
+def contrasts(mtf: Any) -> tuple[float, float]:
     """Return the contrast at Nyquist across and along the track; one number stands for both."""
     from beers_deploy.profiles.instrument import MTF_NYQUIST_MAX
 
-    parts = mtf.split(",") if isinstance(mtf, str) else list(mtf)
+    # One number of Python stands for itself.
+    parts = list(mtf) if isinstance(mtf, list | tuple) else str(mtf).split(",")
     try:
         across, along = (float(part) for part in (parts * 2)[:2])
     except ValueError:

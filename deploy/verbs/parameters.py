@@ -149,7 +149,7 @@ if TYPE_CHECKING:
     Edges: TypeAlias = str | Sequence[str]
     Effects: TypeAlias = Sequence[str]
     Factors: TypeAlias = str | Sequence[float]
-    Mtf: TypeAlias = str | tuple[float, float]
+    Mtf: TypeAlias = str | float | tuple[float, float]
     InputRange: TypeAlias = str | Sequence[float] | Sequence[tuple[float, float]]
 else:
     InputPath = LimitsLike = Samples = Image = Pairs = Path

@@ -23,7 +23,7 @@ from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.results import Table, input_of
-from beers_deploy.studies.characterize.frames import cut_box, open_frames
+from beers_deploy.studies.characterize.frames import MAX_DN, cut_box, open_frames
 from beers_deploy.studies.characterize.measure import measure_mtf, measure_noise, snr_at
 from beers_deploy.studies.characterize.profile import (
     FULL_SCALE_RADIANCE,
@@ -126,7 +126,8 @@ def measured_sensor(
 def _as_file(image: Any, path: Path) -> Path:
     if isinstance(image, str | os.PathLike):
         return Path(image)
-    pixels = np.asarray(getattr(image, "values", image))
+    # 0 stands for a missing pixel, as in a file that is read.
+    pixels = np.ma.filled(getattr(image, "values", image), 0)
     # Arrays of xarray and rasterio have a first axis for the bands.
     if pixels.ndim == 3 and len(pixels) == 1:
         pixels = pixels[0]
@@ -134,6 +135,11 @@ def _as_file(image: Any, path: Path) -> Path:
         raise ImageError(
             "`images` must be integer digital numbers of shape (H, W), but one is "
             f"{pixels.dtype} of shape {pixels.shape}. Give raw pixels of one band."
+        )
+    if pixels.size and not 0 <= pixels.min() <= pixels.max() <= MAX_DN:
+        raise ImageError(
+            f"`images` must have digital numbers from 0 to {MAX_DN}, but one has "
+            f"{pixels.min()} to {pixels.max()}. Give the raw image."
         )
     write_tiff(path, pixels.astype(np.uint16))
     return path

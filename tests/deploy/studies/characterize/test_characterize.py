@@ -15,6 +15,7 @@ from beers_deploy.profiles.errors import BeersError
 from beers_deploy.profiles.instrument import Instrument, noise_from_snr
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.characterize import Stated, measure, profile_toml
+from beers_deploy.verbs.characterize import characterize
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 
@@ -258,6 +259,20 @@ def test_a_profile_that_exists_is_replaced_only_if_asked(tmp_path: Path) -> None
     message = refused("characterize", image, "--bits", 12, "--mtf", 0.1, "--out", edited)
     assert "mine.toml exists already. Add --overwrite" in message
     assert edited.read_text() == "edited by hand"
+
+
+def test_arrays_are_read_like_files() -> None:
+    """One number is an MTF, masked pixels are missing, and numbers below 0 do not wrap around."""
+    noisy = np.random.default_rng(0).normal(np.linspace(200, 3000, 320)[:, None], 20, (320, 320))
+    pixels = noisy.astype(np.int32)
+    spoilt = pixels.copy()
+    spoilt[:20] = 4095
+    masked = np.ma.masked_equal(spoilt, 4095)
+    sensor = characterize(masked, bits=12, mtf=0.08)
+    assert sensor.snr_pair == characterize(masked.filled(0), bits=12, mtf="0.08").snr_pair
+    assert sensor.mtf_nyquist.low == 0.08
+    with pytest.raises(BeersError, match="from 0 to 65535, but one has -"):
+        characterize(pixels - 3000, bits=12, mtf=0.08)
 
 
 def test_one_image_twice_or_images_of_two_gains_are_refused(
