@@ -207,7 +207,12 @@ def delta_of_file(model: onnx.ModelProto) -> bytes:
             # Only the bank's weights depend on the sensor.
             arrays += [op.weight, op.bias] if op.input == PLANES else [op.bias]
     unit = core.host_part.unit
-    header = {"sensor": metadata(model).get("sensor", ""), "unit": unit, "bits": bits}
+    header = {
+        "sensor": metadata(model).get("sensor", ""),
+        "network": _weights_crc(core),
+        "unit": unit,
+        "bits": bits,
+    }
     numbers = b"".join(values.astype(np.int8).tobytes() for values in arrays)
     # JSON without indent holds no line break, so the first one in a delta ends its header.
     line = json.dumps(header, separators=(",", ":")).encode()
@@ -233,6 +238,8 @@ def with_delta(core: IntCore, delta: bytes, where: str = "The delta") -> tuple[I
         content = zlib.decompressobj().decompress(delta, LARGEST_DELTA)
         line, _, numbers = content.partition(b"\n")
         header = json.loads(line)
+        if header["network"] != _weights_crc(core):
+            raise ValueError("it was written for other weights")
         stream = BytesIO(numbers)
         bits = dict(header["bits"])
         ops = list[IntConv | Op]()
@@ -264,6 +271,18 @@ def with_delta(core: IntCore, delta: bytes, where: str = "The delta") -> tuple[I
 
 LARGEST_DELTA = 1 << 20
 """The maximum size of the unpacked content, in bytes."""
+
+
+def _weights_crc(core: IntCore) -> int:
+    """Compute a checksum of the weights that all sensors of a network share.
+
+    Two networks of the same layers differ in it. Without it the delta of one would fit the other.
+    """
+    crc = 0
+    for op in core.convolutions:
+        if op.input != PLANES:
+            crc = zlib.crc32(op.weight.astype(np.int8).tobytes(), crc)
+    return crc
 
 
 def _read_like(values: np.ndarray, stream: BytesIO) -> np.ndarray:

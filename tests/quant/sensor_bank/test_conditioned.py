@@ -274,6 +274,16 @@ def test_a_damaged_delta_and_one_of_another_network_are_refused(
             with_delta(other, content)
 
 
+def test_a_delta_does_not_fit_a_network_of_the_same_layers(pair: Pair) -> None:
+    core = core_of(pair[1], SENSORS[1])
+    delta = delta_of_file(file_of(pair[1], SENSORS[1]))
+    last = next(op for op in reversed(core.ops) if isinstance(op, IntConv))
+    other = replace(last, weight=last.weight[::-1].copy())
+    ops = tuple(other if op is last else op for op in core.ops)
+    with pytest.raises(ModelError, match=r"belongs to another network .*other weights"):
+        with_delta(replace(core, ops=ops), delta)
+
+
 def test_words_of_another_network_are_refused(
     pair: Pair,
 ) -> None:
