@@ -14,9 +14,15 @@ from beers_deploy.profiles.target_limits import LIMITS
 from docs.make.target_file import BUILD, KEYS
 from tests.deploy.command_line import done, refused
 
+FOREIGN = [
+    ("measurement", "min_runs"),
+    ("measurement", "min_time_s"),
+    ("file", "opset_max"),
+]
+"""Keys of a host or an NPU, which nothing reads for a DPU."""
 PLACES = list[tuple[str, str]]()
 for name, keys in KEYS.items():
-    PLACES += [(name, key) for key in keys]
+    PLACES += [(name, key) for key in keys if (name, key) not in FOREIGN]
 ANY_KEY = st.sampled_from(PLACES)
 NOT_NUMBERS = ("nan", "-inf", '"16"', "true", "[]", "[1, 2, 3]", "{}", "1979-05-27")
 
@@ -99,6 +105,13 @@ def test_a_misspelt_key_or_table_is_refused_with_the_right_name(
         message = refusal(board(tmp_path_factory.mktemp("board"), f"{table}x", key, "1"))
         assert f"my-board.toml has the unknown key '{table}x'; it can have the keys " in message
         assert message.endswith(f". Write {table!r}.")
+
+
+@pytest.mark.parametrize("place", FOREIGN)
+def test_a_key_of_another_device_is_refused(place: tuple[str, str], tmp_path: Path) -> None:
+    message = refusal(board(tmp_path, *place, "5"))
+    assert f"has the unknown key {place[0]!r}; it can have the keys " in message
+    assert place[0] not in message.partition("can have the keys ")[2]
 
 
 @pytest.mark.parametrize("key", ["cores", "aie_cores", "batch_handlers", "cpb"])
