@@ -15,9 +15,10 @@ from beers_deploy.kit.host_facts import host_facts
 from beers_deploy.kit.record import require_library, write_record
 from beers_deploy.model.consistency.step import REACH_PX
 from beers_deploy.model.exposure import HEADROOM, SHARPEST, SHARPEST_IN_DARK
-from beers_deploy.model.io.files import write_text
+from beers_deploy.model.io.files import require_writable, write_text
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.network_files import other_sensor
+from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.shipped import BLIND, TILE_PX
 from beers_deploy.profiles.target import TargetProfile
@@ -85,9 +86,13 @@ class Board(TargetProfile):
             MissingExtraError: a record is requested, and cyclonedx-python-lib is not installed.
             ModelError: the network is float, damaged, or was not quantised under a DPU's rules
                 here.
-            OptionError: the sensor would change nothing.
+            MachineError: `out` is not a folder.
+            OptionError: the sensor would change nothing, or `tile` is not a side of 16 to 8192
+                pixels.
             ProfileError: there is no such sensor.
         """
+        _require_tile(tile)
+        require_writable(folders=[Path(out)])
         profile = None if sensor is None else Sensor.load(sensor)
         images_of = profile or Sensor.load(BLIND)
         network = to_run_on(Network.load(int8, sensor=images_of), images_of)
@@ -133,6 +138,14 @@ class Board(TargetProfile):
         }
         write_text(folder / "README.md", README.read_text(encoding="utf-8").format(**words))
         return folder
+
+
+def _require_tile(tile: int) -> None:
+    """Raise OptionError if `tile` is not the side of a tile that a core can have."""
+    if not isinstance(tile, int) or not 16 <= tile <= 8192:
+        raise OptionError(
+            f"`tile` must be a whole number of 16 to 8192 px, got {tile!r}. Choose another."
+        )
 
 
 def _write_example(core: Network, folder: Path) -> None:

@@ -54,10 +54,12 @@ def host_facts(
     facts = host_constants(network, tile_px)
     step = consistency_facts(network, sensor) if sensor is not None and facts is not None else None
     if sensor is not None and step is None and not exposed:
+        reason = "neither the consistency step nor exposures can be used"
+        if network.input_ranges:
+            reason = "host.py has no steps for a network that reads another range than [0, 1]"
         raise OptionError(
-            f"`sensor` {sensor.name} has no effect on {network.label}, because neither the "
-            "consistency step nor exposures can be used. Leave it out, or name a shipped network "
-            "and a known sensor."
+            f"`sensor` {sensor.name} has no effect on {network.label}, because {reason}. Leave it "
+            "out, or name a shipped network and a known sensor."
         )
     if facts is None:
         return None

@@ -29,7 +29,7 @@ from beers_deploy.model.exposure import choose_factors, exposures_for
 from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.self_check import SelfCheck
 from beers_deploy.model.variants import Variant
-from beers_deploy.profiles.errors import OptionError, ProfileError
+from beers_deploy.profiles.errors import MachineError, OptionError, ProfileError
 from beers_deploy.profiles.response import MtfTable
 from beers_deploy.profiles.sensor_file import axes_of
 from beers_deploy.quant.encodings import host_model
@@ -264,11 +264,24 @@ def test_a_sensor_that_does_not_exist_or_changes_nothing_is_one_sentence(tmp_pat
         board.kit(NAME, tmp_path / "kit", tile=TILE_PX, sensor="hubble")
     with pytest.raises(OptionError, match="`sensor` blind has no effect"):
         board.kit(in_memory, tmp_path / "kit", tile=TILE_PX, sensor="blind")
-    # ESPCN enlarges the image.
-    enlarging = network("espcn")
-    with pytest.raises(OptionError, match="`sensor` pleiades-degraded has no effect"):
-        host_facts(enlarging, TILE_PX, bd.Sensor.load("pleiades-degraded"), {})
+    # ESPCN enlarges the image, and a kit's steps work in shares of full scale.
+    for name, reason in (("espcn", "neither the"), (NORMALISED, r"host.py .* than \[0, 1\]")):
+        with pytest.raises(OptionError, match=f"pleiades-degraded has no effect.* {reason}"):
+            host_facts(network(name), TILE_PX, bd.Sensor.load("pleiades-degraded"), {})
     assert not (tmp_path / "kit").exists()
+
+
+@pytest.mark.parametrize("tile", [-1, 8, 64.5, "a", 10**6])
+def test_a_tile_that_no_core_has_is_refused(tile: Any, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="`tile` must be a whole number of 16 to 8192 px"):
+        bd.Board.load("vck190").kit(NAME, tmp_path / "kit", tile=tile)
+    assert not (tmp_path / "kit").exists()
+
+
+def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "kit").write_text("mine", encoding="utf-8")
+    with pytest.raises(MachineError, match=r"kit is not a folder\. Choose another path"):
+        bd.Board.load("vck190").kit(NAME, tmp_path / "kit")
 
 
 def test_a_network_for_another_sensor_is_a_warning(
