@@ -334,6 +334,6 @@ def require_quantized(model: onnx.ModelProto, name: str, expected: bool) -> None
     if is_quantized(model) != expected:
         kinds = ("a float network", "an INT8 network")
         raise ModelError(
-            f"{name} must be {kinds[expected]}, but it is {kinds[not expected]}. Give the float "
-            "model first, the INT8 model second."
+            f"{name} must be {kinds[expected]}, but it is {kinds[not expected]}. Give "
+            f"{kinds[expected]} in its place."
         )

@@ -84,6 +84,8 @@ def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[st
 
 def _results(golden: Golden, folder: Path) -> Results:
     """Read the results of a board. Raise OptionError for a file that is not a result."""
+    if not folder.is_dir():
+        raise OptionError(f"{folder} is not a folder of a board's results. Check the path.")
     files = files_of(golden.core)
     paths = [path for path in folder.glob("*/*.npy") if path.name != PICTURE]
     unknown = [

@@ -121,7 +121,7 @@ def bench(
     from beers_deploy.results import inputs_of, require_same
 
     if within == 0:
-        raise OptionError("`within` must be above 0 s, got 0.")
+        raise OptionError("`within` must be above 0 s, got 0. Give the time that you have.")
     tiles_px = parse_tiles(tile)
     profile = Sensor.load(sensor)
     paths = [path_or_none(path) for path in (image, measured)]

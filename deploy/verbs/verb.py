@@ -119,11 +119,11 @@ def _require_type(name: str, value: object, parts: list[Any]) -> None:
 def _require_inside(name: str, value: float, interval: Interval) -> None:
     low = -math.inf if interval.ge is None else float(str(interval.ge))
     high = math.inf if interval.le is None else float(str(interval.le))
-    # NaN lies in no interval.
-    if low <= value <= high:
+    # NaN lies in no interval. An infinite number would be no valid JSON in the results.
+    if low <= value <= high and not math.isinf(value):
         return
     if math.isinf(high):
-        raise OptionError(f"`{name}` must be at least {low:g}, got {value:g}.")
+        raise OptionError(f"`{name}` must be a finite number of at least {low:g}, got {value:g}.")
     raise OptionError(f"`{name}` must be from {low:g} to {high:g}, got {value:g}.")
 
 

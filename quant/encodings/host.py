@@ -358,8 +358,8 @@ def read_core(model: onnx.ModelProto) -> IntCore:
     if text is not None:
         return described_core(text, constants(model))
     raise ModelError(
-        "The network's file does not describe its integers, as INT8 files of 'beers-deploy "
-        "quantize' do. Make it with that command."
+        "The network is float, or its file does not describe its integers, as INT8 files of "
+        "'beers-deploy quantize' do. Give an INT8 file that this command wrote."
     )
 
 
