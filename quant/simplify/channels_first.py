@@ -107,8 +107,12 @@ def _on_first(graph: OnnxGraph, node: Node, sources: Mapping[str, str], first: s
     if kind == "MatMul" and number is not None and number.ndim == 2:
         return graph.convolution(source, first, node.name, number.T[:, :, None, None])
     if kind == "Pad" and number is not None:
-        pads = number.reshape(2, 4)[:, TO_FIRST].ravel()
-        name = graph.add_constant(f"{first}.pads", pads, number.dtype)
+        stated = graph.value(node, 3)
+        # Without axes a Pad states all four; with them some, in any order.
+        places = [TO_LAST[axis % 4] for axis in (range(4) if stated is None else stated.tolist())]
+        pads = np.zeros((2, 4), number.dtype)
+        pads[:, places] = number.reshape(2, -1)
+        name = graph.add_constant(f"{first}.pads", pads.ravel(), number.dtype)
         return Node.new(kind, [source, name, *node.inputs[2:3]], first, node.name, **attributes)
     if kind == "ReduceMean" and attributes.get("keepdims", 1):
         axes = graph.numbers(node, 1, "axes")

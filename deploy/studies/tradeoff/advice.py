@@ -114,8 +114,7 @@ def _parse(option: str, text: str) -> Constraint:
     if fields["unit"] not in ("", unit.lower()):
         raise OptionError(
             f"`{option}` must give {key} in {unit}, but its unit is "
-            f"{printable(repr(fields['unit']))}. Write "
-            f"{fields['name']}{fields['side']}{fields['limit']}{unit}."
+            f"{printable(repr(fields['unit']))}. Convert the number to {unit}."
         )
     limit = Constraint(key, fields["side"] == "<=", float(fields["limit"]), unit)
     # Every figure that can have an upper limit is above 0, so that no point would comply.

@@ -8,6 +8,7 @@ import onnx
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from onnx.reference import ReferenceEvaluator
 
 from beers_deploy.quant.graph import read_network, refusal
 from beers_deploy.quant.session import open_session, result_of
@@ -91,6 +92,25 @@ def test_channels_that_are_last_between_other_layers_become_first(
     image = 1 + IMAGE
     before = result_of(open_session(model), np.moveaxis(image, 1, 3) if image_last else image)
     np.testing.assert_allclose(result_of(open_session(short), image), before, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("axes", "pads"), [([1], [1, 2]), ([-2, -3], [0, 1, 2, 0]), ([2, 1, 0, 3], [1, 2, *[0] * 6])]
+)
+def test_pads_of_channels_last_may_name_their_axes(axes: list[int], pads: list[int]) -> None:
+    model = made(
+        "u = Transpose<perm=[0,2,3,1]>(x) p = Pad(u, pads, , axes) "
+        "v = Transpose<perm=[0,3,1,2]>(p) y = Conv(v, end)",
+        opset=18,
+        pads=pads,
+        axes=axes,
+        end=np.ones((1, CHANNELS, 1, 1)),
+    )
+    short = simplify(model, "a.onnx")
+    assert "Transpose" not in {n.op_type for n in short.graph.node}
+    # onnxruntime moves such a Transpose itself, and leaves the axes as they were.
+    before = ReferenceEvaluator(model).run(None, {"x": IMAGE})[0]
+    np.testing.assert_allclose(result_of(open_session(short), IMAGE), before, rtol=1e-4)
 
 
 def test_pads_that_follow_from_an_even_size_are_stated() -> None:
