@@ -54,7 +54,7 @@ def test_a_command_says_how_many(
     assert [path.name for path in tmp_path.iterdir()] == ["raw.tif"]
 
 
-@pytest.mark.parametrize("seconds", ["0", "-1", "-0.0", "nan"])
+@pytest.mark.parametrize("seconds", ["0", "-1", "-0.0", "nan", "inf"])
 def test_a_swath_takes_some_time(seconds: str) -> None:
     assert "--within" in refused("bench", "--no-traditional", "--within", seconds)
 

@@ -23,7 +23,7 @@ from beers_deploy.kit.golden import (
 )
 from beers_deploy.kit.golden_results import compare_golden, where
 from beers_deploy.network import Network
-from beers_deploy.profiles.errors import BeersError
+from beers_deploy.profiles.errors import BeersError, OptionError
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.graph import PLANES
 from beers_deploy.quant.integer.reference import layer_sums, rounded, saturated
@@ -269,3 +269,8 @@ def test_older_vectors_do_not_stay(copied: Path) -> None:
     assert not stale.exists()
     assert (copied / "odd" / "notes.txt").exists()
     assert read_golden(copied)
+
+
+def test_results_that_do_not_exist_are_no_folder(copied: Path, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=r"none is not a folder of a board's results"):
+        compare_golden(copied, tmp_path / "none")
