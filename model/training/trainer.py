@@ -63,6 +63,8 @@ class Worker:
 
     def device(self, name: str) -> torch.device:
         """Return the device of that name; with several GPUs, the one of this worker."""
+        if name.partition(":")[0] not in ("cpu", "cuda"):
+            raise OptionError(f"`device` must be cpu or cuda, got {name!r}.")
         device = torch.device(name)
         if device.type == "cuda" and not torch.cuda.is_available():
             raise MachineError(

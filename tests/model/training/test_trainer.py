@@ -24,9 +24,9 @@ from beers_deploy.model.training.checkpoint import (
     finish,
 )
 from beers_deploy.model.training.source import Batch, PatchSource
-from beers_deploy.model.training.trainer import Precision, Schedule, Speed, Trainer
+from beers_deploy.model.training.trainer import Precision, Schedule, Speed, Trainer, Worker
 from beers_deploy.model.variants import Variant
-from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.errors import ModelError, OptionError
 from tests.model.training.sources import small_scene, source
 
 VARIANT = Variant(blocks=1, features=4)
@@ -329,3 +329,9 @@ def test_fine_tuning_starts_from_the_weights_given(tmp_path: Path) -> None:
         torch.equal(a, b)
         for a, b in zip(first.parameters(), tuned.network.parameters(), strict=True)
     )
+
+
+@pytest.mark.parametrize("name", ["tpu", "mps", "meta", ""])
+def test_a_device_that_training_does_not_know_is_refused(name: str) -> None:
+    with pytest.raises(OptionError, match="`device` must be cpu or cuda"):
+        Worker().device(name)
