@@ -142,7 +142,7 @@ class Board(TargetProfile):
 
 def _require_tile(tile: int) -> None:
     """Raise OptionError if `tile` is not the side of a tile that a core can have."""
-    if not isinstance(tile, int) or not 16 <= tile <= 8192:
+    if not isinstance(tile, int | np.integer) or not 16 <= tile <= 8192:
         raise OptionError(
             f"`tile` must be a whole number of 16 to 8192 px, got {tile!r}. Choose another."
         )

@@ -109,8 +109,8 @@ def test_pads_of_channels_last_may_name_their_axes(axes: list[int], pads: list[i
     short = simplify(model, "a.onnx")
     assert "Transpose" not in {n.op_type for n in short.graph.node}
     # onnxruntime moves such a Transpose itself, and leaves the axes as they were.
-    before = ReferenceEvaluator(model).run(None, {"x": IMAGE})[0]
-    np.testing.assert_allclose(result_of(open_session(short), IMAGE), before, rtol=1e-4)
+    (before,) = ReferenceEvaluator(model).run(None, {"x": IMAGE})
+    np.testing.assert_allclose(result_of(open_session(short), IMAGE), np.asarray(before), rtol=1e-4)
 
 
 def test_pads_that_follow_from_an_even_size_are_stated() -> None:
