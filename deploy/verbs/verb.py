@@ -96,24 +96,19 @@ def require_allowed(parameter: Parameter, value: object) -> None:
 
 def _require_type(name: str, value: object, parts: list[Any]) -> None:
     """Raise OptionError if a switch is given as text, or if a number is no number of its type."""
-    got = printable(repr(value))
     # The text "no" would count as True.
     if bool in parts and isinstance(value, str):
-        raise OptionError(f"`{name}` must be True or False, got {got}.")
+        raise OptionError(f"`{name}` must be True or False, got {printable(repr(value))}.")
     if not {int, float}.intersection(parts):
         return
-    number = math.nan
     # float() would read text, and would count True as 1.
-    is_number = not isinstance(value, str | bool)
-    if is_number:
-        try:
-            number = float(cast(float, value))
-        except (TypeError, ValueError, OverflowError):
-            is_number = False
-    if not is_number:
-        raise OptionError(f"`{name}` must be one number, got {got}.")
+    given = None if isinstance(value, str | bool) else value
+    try:
+        number = float(cast(float, given))
+    except (TypeError, ValueError, OverflowError) as error:
+        raise OptionError(f"`{name}` must be one number, got {printable(repr(value))}.") from error
     if float not in parts and not number.is_integer():
-        raise OptionError(f"`{name}` must be an integer, got {got}.")
+        raise OptionError(f"`{name}` must be an integer, got {printable(repr(value))}.")
 
 
 def _require_inside(name: str, value: float, interval: Interval) -> None:
