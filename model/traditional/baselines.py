@@ -16,7 +16,7 @@ from skimage import restoration
 from torch import Tensor
 
 from beers_deploy.model.simulator.detector import to_dn, to_radiance
-from beers_deploy.model.simulator.mtf import transfer_function
+from beers_deploy.model.simulator.mtf import sensor_transfer
 from beers_deploy.model.traditional.compensate import filter_strips
 from beers_deploy.model.traditional.noise import (
     bias_radiance,
@@ -132,7 +132,8 @@ def _deconvolved(
     share = (dn.double() - pipeline.degraded.offset_dn) / pipeline.degraded.max_dn
     padded = share[rows][:, columns].numpy()
     blur, target = (
-        transfer_function(height, width, 1, s.blur) for s in (pipeline.degraded, pipeline.reference)
+        sensor_transfer(height, width, 1, sensor)
+        for sensor in (pipeline.degraded, pipeline.reference)
     )
     sharp = fft.rfft2(deconvolve(padded, blur)) * target
     inside = fft.irfft2(sharp, s=(height, width))[PAD_PX:-PAD_PX, PAD_PX:-PAD_PX]

@@ -14,9 +14,10 @@ from scipy.fft import next_fast_len
 from torch import Tensor
 
 from beers_deploy.model.bank import cut_filter, restoring_gain
-from beers_deploy.model.simulator.mtf import Blur, mtf
+from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.model.traditional.rows import Rows, fill_with_local_means, map_tiles, mirrored
 from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import NYQUIST
 
 RADIUS_PX = 64
@@ -77,17 +78,16 @@ def _block(rows: Tensor, kernel: Tensor, left: int) -> Tensor:
     return (filtered[inside] + mean).where(valid[core], torch.nan)
 
 
-def compensation_kernel(blur_from: Blur, blur_to: Blur, epsilon: float) -> Tensor:
-    """Compute a filter that converts an image with one blur to an image with another.
+def compensation_kernel(degraded: Instrument, reference: Instrument, epsilon: float) -> Tensor:
+    """Compute a filter that converts an image with the blur of one sensor to that of another.
 
     It is the filter with the gain `compensation_gain`, cut to 2 R + 1 pixels and corrected to the
     sum 1. Of three pairs of blurs the cut changes the gain by up to 0.7 % below 2 cycles per 2 R
     pixels, 0.1 % above, and 3 % near Nyquist (measured).
 
     Args:
-        blur_from: the blur of the image: its MTF at Nyquist or its complete response, as in
-            `compensation_gain`.
-        blur_to: the blur to reach, likewise.
+        degraded: the instrument that acquired the image.
+        reference: the instrument whose blur is to be reached.
         epsilon: strength of the regularisation, 0 or more; a larger one sharpens less.
 
     Returns:
@@ -98,12 +98,12 @@ def compensation_kernel(blur_from: Blur, blur_to: Blur, epsilon: float) -> Tenso
     """
     # Sampled this finely, the slow tail folds back onto the filter little.
     side = 8 * RADIUS_PX
-    gain = compensation_gain(side, side, blur_from, blur_to, epsilon)
+    gain = compensation_gain(side, side, degraded, reference, epsilon)
     return torch.from_numpy(cut_filter(np.fft.irfft2(gain, (side, side)), RADIUS_PX, total=1))
 
 
 def compensation_gain(
-    height: int, width: int, blur_from: Blur, blur_to: Blur, epsilon: float
+    height: int, width: int, degraded: Instrument, reference: Instrument, epsilon: float
 ) -> NDArray[np.inexact]:
     """Compute G = T H* / (|H|^2 + epsilon r^2), the gain that converts one blur to another, at each
     frequency.
@@ -115,9 +115,8 @@ def compensation_gain(
     Args:
         height: the number of rows of the image.
         width: the number of columns of the image.
-        blur_from: the blur of the image: its MTF at Nyquist in (0, 2 / pi], one number or those
-            across and along the track; or its complete response.
-        blur_to: the blur to reach, likewise.
+        degraded: the instrument with the MTF H, smear and anti-alias filter included.
+        reference: the instrument with the MTF T.
         epsilon: strength of the regularisation, 0 or more.
 
     Returns:
@@ -135,4 +134,5 @@ def compensation_gain(
     fy = np.fft.fftfreq(height)[:, None]
     fx = np.fft.rfftfreq(width)[None, :]
     r_squared = (fx**2 + fy**2) / NYQUIST**2
-    return restoring_gain(mtf(fx, fy, blur_from), mtf(fx, fy, blur_to), r_squared, epsilon)
+    blur = sensor_mtf(fx, fy, degraded)
+    return restoring_gain(blur, sensor_mtf(fx, fy, reference), r_squared, epsilon)

@@ -91,7 +91,7 @@ class TraditionalPipeline:
                 "The pipeline has no epsilon yet. Call TraditionalPipeline.fitted_to with the "
                 "strips of the image first."
             )
-        return compensation_kernel(self.degraded.blur, self.reference.blur, self.epsilon)
+        return compensation_kernel(self.degraded, self.reference, self.epsilon)
 
 
 def restore_traditional(dn: Tensor, pipeline: TraditionalPipeline) -> Tensor:

@@ -21,6 +21,7 @@ from beers_deploy.quant.host_part import IMAGE_SLICES, DualRange
 from beers_deploy.quant.integer.reference import correction
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.session import open_session, run
+from tests.model.simulator.stages import with_contrast
 
 
 def ssim_by_two_passes(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
@@ -95,7 +96,7 @@ def test_no_inverse_amplifies_beyond_what_its_regularisation_proves(
     mtf_from: float, mtf_to: float, epsilon: float
 ) -> None:
     """T H / (H^2 + epsilon r^2) is at most T / (2 sqrt(epsilon) r), whatever the blur H."""
-    gain = compensation_gain(32, 30, mtf_from, mtf_to, epsilon)
+    gain = compensation_gain(32, 30, with_contrast(mtf_from), with_contrast(mtf_to), epsilon)
     fy = np.fft.fftfreq(32)[:, None]
     fx = np.fft.rfftfreq(30)
     radius = np.hypot(fy, fx) / NYQUIST

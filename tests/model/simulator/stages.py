@@ -82,6 +82,11 @@ def with_response(sensor: Instrument, response: Response) -> Instrument:
     return replace(sensor, mtf_nyquist=across, mtf_nyquist_along=along, response=response)
 
 
+def with_contrast(mtf_nyquist: float) -> Instrument:
+    """The nominal degraded sensor with another contrast at Nyquist."""
+    return replace(NOMINAL, mtf_nyquist=mtf_nyquist)
+
+
 def point_spread(samples: np.ndarray, per_px: float) -> PointSpread:
     """These samples (H, W), as a profile keeps them."""
     return PointSpread(len(samples), samples.shape[1], per_px, packed(samples))

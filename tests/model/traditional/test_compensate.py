@@ -6,18 +6,22 @@ import numpy as np
 import pytest
 import torch
 
-from beers_deploy.model.simulator.mtf import Blur, mtf, transfer_function
+from beers_deploy.model.simulator.mtf import mtf, sensor_mtf, transfer_function
 from beers_deploy.model.traditional import compensate as module
 from beers_deploy.model.traditional.compensate import (
     compensation_gain,
     compensation_kernel,
     filter_strips,
 )
+from beers_deploy.profiles.effects import AntiAlias, Smear
 from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.instrument import Instrument
 from tests.model.simulator import stages
+from tests.model.simulator.stages import NOMINAL, plain_sensor, with_contrast, with_response
 from tests.model.traditional.whole import compensate
 
 EPSILON = 3e-3
+REFERENCE = with_contrast(0.25)
 
 
 def texture(height: int, width: int) -> torch.Tensor:
@@ -32,26 +36,36 @@ def texture(height: int, width: int) -> torch.Tensor:
 def test_gain_is_one_at_dc_and_finite_everywhere(
     mtf_from: float, mtf_to: float, epsilon: float
 ) -> None:
-    gain = compensation_gain(26, 35, mtf_from, mtf_to, epsilon)
+    gain = compensation_gain(26, 35, with_contrast(mtf_from), with_contrast(mtf_to), epsilon)
     assert float(gain[0, 0]) == 1
     assert np.isfinite(gain).all()
     assert (gain >= 0).all()
 
 
-@pytest.mark.parametrize("blur_from", [0.07, stages.lopsided_point()])
-def test_without_regularisation_a_blur_is_undone_whole(blur_from: Blur) -> None:
+@pytest.mark.parametrize(
+    "degraded",
+    [
+        NOMINAL,
+        plain_sensor(smear=Smear(1.5)),
+        plain_sensor(antialias=AntiAlias(0.4)),
+        with_response(NOMINAL, stages.lopsided_point()),
+    ],
+    ids=["formula", "smear", "anti-alias filter", "point spread"],
+)
+def test_without_regularisation_a_blur_is_undone_whole(degraded: Instrument) -> None:
     """What a point spread shifted and turned lies straight again: gain times blur is the target,
     phase and all.
     """
     fx = np.fft.rfftfreq(34)[None]
     fy = np.fft.fftfreq(26)[:, None]
-    undone = compensation_gain(26, 34, blur_from, 0.25, epsilon=0) * mtf(fx, fy, blur_from)
+    gain = compensation_gain(26, 34, degraded, REFERENCE, epsilon=0)
+    undone = gain * sensor_mtf(fx, fy, degraded)
     np.testing.assert_allclose(undone, mtf(fx, fy, 0.25), rtol=1e-9, atol=1e-12)
 
 
 def test_regularisation_holds_the_noise_of_a_weak_mtf_down() -> None:
-    assert float(compensation_gain(26, 34, 0.03, 0.25, epsilon=0).max()) > 15
-    assert float(compensation_gain(26, 34, 0.03, 0.25, EPSILON).max()) < 5
+    assert float(compensation_gain(26, 34, with_contrast(0.03), REFERENCE, epsilon=0).max()) > 15
+    assert float(compensation_gain(26, 34, with_contrast(0.03), REFERENCE, EPSILON).max()) < 5
 
 
 @pytest.mark.parametrize("mtf_from", [0.07, 1.001e-4])
@@ -71,16 +85,20 @@ def test_a_regulariser_that_reaches_dc_would_not_preserve_it() -> None:
     blur, target = (transfer_function(128, 128, 1, m) for m in (0.07, 0.25))
     plain = float((target * blur / (blur**2 + 1e-2))[0, 0])
     assert plain == pytest.approx(1 / 1.01)
-    assert float(compensation_kernel(0.07, 0.25, 1e-2).sum()) == pytest.approx(1, abs=1e-12)
+    assert float(compensation_kernel(with_contrast(0.07), REFERENCE, 1e-2).sum()) == pytest.approx(
+        1, abs=1e-12
+    )
 
 
 @pytest.mark.parametrize("mtf_from", [0.03, 0.07])
 def test_the_kernel_keeps_the_gain_off_dc(mtf_from: float) -> None:
-    kernel = compensation_kernel(mtf_from, 0.25, EPSILON)
+    kernel = compensation_kernel(with_contrast(mtf_from), REFERENCE, EPSILON)
     padded = torch.zeros(512, 512, dtype=torch.float64)
     padded[:129, :129] = kernel
     gain = torch.fft.rfft2(padded.roll((-64, -64), (0, 1)))
-    expected = torch.from_numpy(compensation_gain(512, 512, mtf_from, 0.25, EPSILON))
+    expected = torch.from_numpy(
+        compensation_gain(512, 512, with_contrast(mtf_from), REFERENCE, EPSILON)
+    )
     assert float(gain.imag.abs().max()) < 1e-9
     error = (gain.real / expected - 1).abs()
     assert float(error[8:240, 8:240].max()) < 2e-3
@@ -90,7 +108,7 @@ def test_the_kernel_keeps_the_gain_off_dc(mtf_from: float) -> None:
 
 def test_strips_and_blocks_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     image = texture(203, 187)
-    kernel = compensation_kernel(0.07, 0.25, EPSILON)
+    kernel = compensation_kernel(with_contrast(0.07), REFERENCE, EPSILON)
     at_once = compensate(image, 0.07, 0.25, EPSILON)
     strips = torch.cat(list(filter_strips(torch.split(image, 7), 203, kernel)))
     assert torch.equal(strips, at_once)
@@ -129,4 +147,4 @@ def test_it_carries_one_blur_into_the_other() -> None:
 @pytest.mark.parametrize("epsilon", [-1e-3, float("nan"), float("inf")])
 def test_a_senseless_epsilon_is_refused(epsilon: float) -> None:
     with pytest.raises(OptionError, match="epsilon"):
-        compensation_gain(8, 8, 0.07, 0.25, epsilon)
+        compensation_gain(8, 8, with_contrast(0.07), REFERENCE, epsilon)
