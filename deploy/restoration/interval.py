@@ -4,6 +4,7 @@
 nothing else, so the rows that are asked for, tiles and a resumed run change no byte.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from beers_deploy.model.raster.source import Source, strips
 from beers_deploy.model.raster.writer import write_raster
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.restoration.bands import by_band
@@ -90,6 +92,19 @@ class HalfWidths:
         return self.bands[band].of(pixels, valid)[start - top : stop - top]
 
 
+def require_sensors(sensors: Mapping[str, Sensor]) -> None:
+    """Raise OptionError if the sensor of a band is unknown, because the interval is then too.
+
+    Args:
+        sensors: the sensor by the name of the band; a sensor for all bands has the key "".
+    """
+    if any(sensor.name == BLIND for sensor in sensors.values()):
+        raise OptionError(
+            "`interval` needs the sensor of every band, whose noise is its unit. Name it with "
+            "`sensor`, or omit `interval`."
+        )
+
+
 def half_widths_of(work: Restoration, level: Level) -> tuple[HalfWidth, ...]:
     """Build, for each band of an image, the formula that computes the half-widths of its pixels.
 
@@ -98,8 +113,8 @@ def half_widths_of(work: Restoration, level: Level) -> tuple[HalfWidth, ...]:
         level: the share of pixels whose error lies within the interval, in percent.
 
     Raises:
-        OptionError: the sensor of a band is unknown, the network does not return one pixel of the
-            same band for each pixel, or the network has no interval of this level.
+        OptionError: the network does not return one pixel of the same band for each pixel, or it
+            has no interval of this level.
         ModelError: the network has no calibrated interval.
     """
     raster = work.source.raster
@@ -108,15 +123,10 @@ def half_widths_of(work: Restoration, level: Level) -> tuple[HalfWidth, ...]:
             "`interval` needs a network that gives one pixel of the same band for each pixel. "
             "Leave `interval` out."
         )
-    sensors = work.reading.sensors
-    if not sensors or any(sensor.name == BLIND for sensor in sensors.values()):
-        raise OptionError(
-            "`interval` needs the sensor of every band, whose noise is its unit. Name it with "
-            "`sensor`, or omit `interval`."
-        )
     # The networks of several bands are one file, conditioned on their sensors.
     interval = interval_of(work.networks[0])
     full_scale = work.scale.value
+    sensors = work.reading.sensors
     return by_band(sensors, raster, lambda s: interval.for_sensor(s.nominal(), full_scale, level))
 
 

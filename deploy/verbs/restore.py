@@ -140,6 +140,7 @@ def restore(
     from beers_deploy.model.raster.reader import require_image_file
     from beers_deploy.restoration.arrays import restore_array
     from beers_deploy.restoration.bands import is_unknown, networks_of, sensors_of
+    from beers_deploy.restoration.interval import require_sensors
     from beers_deploy.restoration.plan import Tiles
     from beers_deploy.restoration.prepare import NetworkPipeline
     from beers_deploy.restoration.radiometry import Reading
@@ -157,9 +158,11 @@ def restore(
         how: dict[str, Any] = {"compression": compression, "cog": cog, "resume": resume}
         how["interval"] = interval
         how["self_check"] = path_or_none(self_check)
-        output = _output(out, (stac, view), overwrite or resume, fix_detectors or "", **how)
+        output = _output(out, (stac, view), overwrite, fix_detectors or "", **how)
     sensors = sensors_of(sensor)
     unknown = is_unknown(sensors)
+    if interval is not None:
+        require_sensors(sensors)
     reading = Reading(
         sensors={} if unknown else sensors,
         full_scale=full_scale,
@@ -252,7 +255,7 @@ def _traditional(quality: str, unknown: bool) -> "Callable[[], Pipeline]":
 def _output(
     out: OutputFile | None,
     documents: tuple[OutputFile | None, OutputFile | None],
-    may_exist: bool,
+    overwrite: bool,
     fix_detectors: str,
     **how: Any,
 ) -> "Output":
@@ -261,10 +264,11 @@ def _output(
     Args:
         out: the TIFF.
         documents: the STAC item and the view.
-        may_exist: whether these files may exist.
+        overwrite: whether these files may exist. They may too if a stopped run can be resumed.
         fix_detectors: what was asked about faulty detectors.
         how: the other fields of `Output`.
     """
+    from beers_deploy.model.io.lock import part_folder
     from beers_deploy.restoration.detectors.fault_list import found_list_path
     from beers_deploy.restoration.interval import interval_beside
     from beers_deploy.restoration.output import Output, require_tiff_name
@@ -285,6 +289,7 @@ def _output(
     # The list of faults is an output of its own where they are searched for.
     listed = found_list_path(path, fix_detectors)
     others = (*named, listed, how["self_check"], widths)
+    may_exist = overwrite or (how["resume"] and part_folder(path).exists())
     for each in (path, *others):
         if each is not None and each.exists() and not may_exist:
             raise OptionError(

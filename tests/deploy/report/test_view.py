@@ -160,9 +160,9 @@ def test_restore_writes_a_page_that_holds_all_it_needs(model: Path, tmp_path: Pa
     assert "Redistribution and use in source and binary forms" in text
     names = [layer["name"] for layer in described(text)]
     assert names == ["raw image", "restored image", "difference"]
-    # A run that goes on, or is repeated, writes the same page.
+    # A run that is repeated writes the same page.
     page.unlink()
-    restore(image, out, network=model, view=page, resume=True, progress=False)
+    restore(image, out, network=model, view=page, overwrite=True, progress=False)
     assert page.read_text(encoding="utf-8") == text
 
 

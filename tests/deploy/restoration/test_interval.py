@@ -135,6 +135,7 @@ def test_most_errors_of_a_drawn_scene_lie_within_the_interval() -> None:
     ("options", "words"),
     [
         ({"sensor": "blind"}, "needs the sensor of every band"),
+        ({"sensor": "blind", "dry_run": True}, "needs the sensor of every band"),
         ({"sensor": f"blue=blind,red={NAME}"}, "needs the sensor of every band"),
         ({"interval": 91}, "must be one of 50, 68, 80, 90, 95, 99, got 91"),
     ],

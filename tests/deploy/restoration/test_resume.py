@@ -19,7 +19,7 @@ import tifffile
 
 from beers_deploy.cli.run import INTERRUPTED
 from beers_deploy.model.io.lock import part_folder
-from beers_deploy.profiles.errors import MachineError
+from beers_deploy.profiles.errors import MachineError, OptionError
 from beers_deploy.restoration.output import RestoredPixels
 from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import begin, noise, stop_after, stopped_after, until
@@ -47,7 +47,7 @@ def expected(image: Path, model: Path) -> bytes:
 
 
 def resume_options(model: Path) -> list[str]:
-    return f"--network {model} --tile {TILE_PX} --resume".split()
+    return f"--network {model} --tile {TILE_PX} --resume --overwrite".split()
 
 
 def test_killed_at_random_moments_it_is_resumed_to_the_same_bytes(
@@ -99,6 +99,8 @@ def test_finished_rows_are_not_restored_again(
     stop_after(50, monkeypatch, AssertionError("restored more than what was left"))
     run(image, out, resume=True)
     assert out.read_bytes() == expected
+    with pytest.raises(OptionError, match="exists already"):
+        run(image, out, resume=True)
 
 
 @pytest.mark.parametrize("calls", [0, 4, 1000])
@@ -130,7 +132,7 @@ def test_a_full_disk_is_an_error_of_one_line_and_loses_no_finished_row(
         run(image, out, compression="none", overwrite=True)
     monkeypatch.undo()
     assert out.read_bytes() == b"old"
-    run(image, out, resume=True)
+    run(image, out, resume=True, overwrite=True)
     assert out.read_bytes() == expected
 
 
@@ -144,7 +146,7 @@ def test_killed_among_its_rows_and_at_its_cog_it_is_resumed_to_the_same_bytes(
     expected = (tmp_path / "expected.tif").read_bytes()
     before = {path.name for path in tmp_path.iterdir()}
     out.write_bytes(b"old")
-    words = f"--network {model} --tile 16 --cog --resume".split()
+    words = f"--network {model} --tile 16 --cog --resume --overwrite".split()
     # The journal is there when some rows are finished, the TIFF when all rows are.
     for sign in ("journal.json", "out.tif"):
         running = begin(image, out, *words)
