@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from beers_deploy.conditioned_file import to_run_on
+from beers_deploy.dpu.board import device_of
 from beers_deploy.dpu.checker.table import check_network
 from beers_deploy.kit.golden import PICTURE, save_array, write_golden
 from beers_deploy.kit.host_facts import host_facts
@@ -87,11 +88,12 @@ class Board(TargetProfile):
             ModelError: the network is float, damaged, or was not quantised under a DPU's rules
                 here.
             MachineError: `out` is not a folder.
-            OptionError: the sensor would change nothing, or `tile` is not a side of 16 to 8192
-                pixels.
+            OptionError: the sensor would change nothing, `tile` is not a side of 16 to 8192 pixels,
+                or the board has neither a DPU nor an NPU.
             ProfileError: there is no such sensor.
         """
         _require_tile(tile)
+        device_of(self)
         require_writable(folders=[Path(out)])
         profile = None if sensor is None else Sensor.load(sensor)
         images_of = profile or Sensor.load(BLIND)

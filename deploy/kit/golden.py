@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from beers_deploy import __version__
-from beers_deploy.dpu.board import BoardLike
+from beers_deploy.dpu.board import BoardLike, device_of
 from beers_deploy.model.io.files import whole_file, write_text
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.arrays import ALONE, load_arrays
@@ -67,7 +67,8 @@ def write_golden(
 
     Raises:
         ModelError: the network was not made by `quantize`.
-        OptionError: the network does not accept images of this size.
+        OptionError: the network does not accept images of this size, or the board has neither a
+            DPU nor an NPU.
     """
     network = Network.load(int8, int8=True)
     # A board that computes the right numbers would be called wrong.
@@ -76,7 +77,7 @@ def write_golden(
     with faults_named(network.label):
         core = read_core(network.model)
     # AMD's kernel for its NPU rounds ties to even.
-    half_even = bool(TargetProfile.load(target).npu)
+    half_even = bool(device_of(TargetProfile.load(target)).target.npu)
     names = files_of(core)
     generator = np.random.default_rng(0)
     images = _images(network, core.host_part.image_channels, tile, generator)

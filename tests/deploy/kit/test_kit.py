@@ -271,6 +271,14 @@ def test_a_sensor_that_does_not_exist_or_changes_nothing_is_one_sentence(tmp_pat
     assert not (tmp_path / "kit").exists()
 
 
+def test_a_host_alone_has_no_kit_and_no_golden_vectors(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="'host-cpu' has no DPU"):
+        bd.Board.load("host-cpu").kit(NAME, tmp_path / "kit", tile=TILE_PX)
+    with pytest.raises(OptionError, match="'host-cpu' has no DPU"):
+        bd.golden(NAME, out=tmp_path / "golden", target="host-cpu")
+    assert not any(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("tile", [-1, 8, 64.5, "a", 10**6])
 def test_a_tile_that_no_core_has_is_refused(tile: Any, tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="`tile` must be a whole number of 16 to 8192 px"):
