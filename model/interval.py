@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from beers_deploy.model.family import noise_over_full_scale
 from beers_deploy.model.levels import LEVELS, Level
-from beers_deploy.model.self_check import noise_variances
+from beers_deploy.model.pixel_noise import noise_variances
 from beers_deploy.model.simulator.mtf import mtf, sensor_mtf
 from beers_deploy.profiles.errors import ModelError, OptionError, printable, reason_of
 from beers_deploy.profiles.instrument import Instrument
@@ -233,7 +233,7 @@ class HalfWidth:
     """The half-width of pixels of one sensor at one level.
 
     Attributes:
-        variances: the variances of the noise, see `model.self_check.noise_variances`.
+        variances: the variances of the noise, see `model.pixel_noise.noise_variances`.
         offset: the pixel value of the dark.
         conditions: those that the sensor sets.
         exponents: how the half-width grows with them, with noise and with detail.

@@ -30,7 +30,7 @@ from beers_deploy.model.interval import (
     noise_and_detail,
 )
 from beers_deploy.model.levels import LEVELS
-from beers_deploy.model.self_check import noise_variances
+from beers_deploy.model.pixel_noise import noise_variances
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.instrument import Instrument
 

@@ -9,8 +9,8 @@ factors. The script needs NumPy, host.json and onnxruntime; a board needs other 
 1. Each tile goes to one core or several (`factors`, `exposed`): core.onnx restores the tile as it
    is. Where host.json has exposures, core-x4.onnx restores dark pixels, multiplied by 4, and so on.
 2. Around a core, the host encodes the tile as int8 planes, and adds the result to it (`restored`).
-3. After the last tile, the consistency step (`consistent`) makes the restored image agree with the
-   raw one at low spatial frequencies, if host.json has its weights.
+3. After the last tile, the consistency step (`consistent`) smooths the dark and makes the restored
+   image agree with the raw one at low spatial frequencies, if host.json has its weights.
 4. Then the self-check (`judged`) blurs the result as the sensor blurs and compares it with the raw
    image, block by block. restored-check.npy holds its two figures of each block.
 5. Each core restores a drawn tile (`known_tile`), to be compared with known.json (`--learn`).
@@ -165,8 +165,26 @@ def largest_around(pixels: np.ndarray, radius: int) -> np.ndarray:
     return pixels
 
 
+def smoothed(x: np.ndarray) -> np.ndarray:
+    """Smooth the noise that the network left in dark parts of a restored band (H, W).
+
+    A guided filter: windows of pixels with less variance than the noise, n, turn to their mean.
+    """
+    side = S["consistency"]["window_px"]
+    dark, growth, square = np.array(S["consistency"]["variances"], F)
+    window = np.full(side, 1 / side, F)
+    wide = np.pad(x, side // 2 * 2, "symmetric")
+    mean = summed(wide, window, window, 1)
+    light = np.maximum(mean - DARK, F(0))
+    n = np.maximum(dark + growth * light + square * light**2, F(0))
+    variance = summed(wide * wide, window, window, 1) - mean * mean
+    rest = n / np.maximum(np.maximum(variance, n), np.finfo(F).tiny)
+    share, mean = (summed(values, window, window, 1) for values in (rest, rest * mean))
+    return np.asarray(x - share * x + mean)
+
+
 def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Correct a restored band x (H, W) to x + G (raw - H x), clipped to [0, 1].
+    """Smooth a restored band x (H, W) and correct it to x + G (raw - H x), clipped to [0, 1].
 
     H is the sensor's blur relative to the reference. G computes the means of blocks and
     interpolates between their centres, which retains only low spatial frequencies.
@@ -175,10 +193,11 @@ def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
         np.array(S["consistency"][name], F)
         for name in ("rows", "columns", "far", "means", "excess")
     )
+    smooth = smoothed(x)
     # The near part of H x is a sum of separable filters, computed for the means of blocks alone.
-    near = extended(x, NEAR)
+    near = extended(smooth, NEAR)
     blurred = sum(summed(near, row, column) for row, column in zip(rows, columns))  # noqa: B905 - as above
-    blurred = blurred + around(block_means(extended(x, BLOCK * (len(far) // 2))), far)
+    blurred = blurred + around(block_means(extended(smooth, BLOCK * (len(far) // 2))), far)
     own = block_means(extended(raw, 0))
     # The converter clips noise at zero: that raises the means of dark blocks, and is no error.
     clipped = np.interp(own, means, excess, right=0.0).astype(F)
@@ -192,7 +211,7 @@ def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
     change = interpolated(residual * usable, x.shape) / np.maximum(share, F(0.25))
     if S["consistency"]["detail"]:
         change = change + np.where(share == 1, detail(raw, near), F(0))
-    return np.asarray(np.clip(x + change, 0, F(1)))
+    return np.asarray(np.clip(x + (change + (smooth - x)), 0, F(1)))
 
 
 def detail(raw: np.ndarray, near: np.ndarray) -> np.ndarray:

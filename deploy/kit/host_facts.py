@@ -4,6 +4,7 @@ the consistency step.
 
 from collections.abc import Mapping
 
+from beers_deploy.model.consistency.smooth import WINDOW_PX
 from beers_deploy.model.consistency.step import Consistency
 from beers_deploy.model.exposure import HEADROOM, SHARPEST, SHARPEST_IN_DARK, edge_radius_px
 from beers_deploy.model.self_check import (
@@ -174,5 +175,7 @@ def consistency_facts(network: Network, sensor: Sensor) -> Facts | None:
     detail = step.detail
     return {
         **{name: getattr(step, name).tolist() for name in names},
+        "window_px": WINDOW_PX,
+        "variances": list(step.smoothing.variances),
         "detail": detail and {"rows": detail.rows.tolist(), "columns": detail.columns.tolist()},
     }

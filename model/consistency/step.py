@@ -2,6 +2,8 @@
 
     x' = x + G (y - H x)
 
+Before that, what noise is left in the dark parts of x is smoothed (`model.consistency.smooth`).
+
 y is the raw image and x the restored one. H is the blur that leads from the reference's MTF to the
 sensor's, H(f) = MTF_sensor(f) / MTF_reference(f), with H(0) = 1. If x is right, y - H x is the
 noise of y. Networks shift the mean by some tenths of a per cent and dim faint points. This error
@@ -50,6 +52,7 @@ from beers_deploy.model.consistency.detail import (
     separable_sums,
     window_weights,
 )
+from beers_deploy.model.consistency.smooth import SMOOTH_PX, Smoothing
 from beers_deploy.model.departure import has_other_curve
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.profiles.instrument import Instrument
@@ -73,7 +76,7 @@ Twice as many changed the PSNR by less than 0.01 dB (measured).
 """
 
 
-REACH_PX = BLOCK_PX * (FAR_BLOCKS + BORDER_BLOCKS + 1) - 1
+REACH_PX = BLOCK_PX * (FAR_BLOCKS + BORDER_BLOCKS + 1) - 1 + SMOOTH_PX
 """The correction of a pixel depends on restored pixels up to this distance."""
 
 RAW_REACH_PX = BLOCK_PX * (BORDER_BLOCKS + 1) - 1 + NEAR_PX
@@ -97,7 +100,9 @@ PRODUCTS_PER_PX = (
     + (2 * FAR_BLOCKS + 1) ** 2 / BLOCK_PX**2  # The far part.
     + 2 * (1 + 1 / BLOCK_PX)  # Interpolation.
 )
-"""The number of multiply-accumulate operations of the step per pixel."""
+"""The number of multiply-accumulate operations of the step per pixel, without smoothing the dark:
+about 30 more where an image is dark.
+"""
 
 DETAIL_PRODUCTS_PER_PX = products_per_px(RANK, NEAR_PX)
 """The number of additional ones where the step corrects finer detail too."""
@@ -124,6 +129,7 @@ class Consistency:
         full_scale: the pixel value at and above which a raw pixel is saturated.
         detail: the step for finer detail, where the sensor's MTF departs from the formula's curve;
             else None.
+        smoothing: the step that smooths x before H is applied to it.
     """
 
     rows: Image
@@ -133,6 +139,7 @@ class Consistency:
     excess: Image
     full_scale: float
     detail: DetailStep | None
+    smoothing: Smoothing
 
     @classmethod
     def of(
@@ -164,12 +171,14 @@ class Consistency:
             excess=excess,
             full_scale=float(scale),
             detail=DetailStep.of(down, right) if has_other_curve(sensor) else None,
+            smoothing=Smoothing.of(sensor, scale),
         )
 
     def correction(
         self, raw: Image, restored: Image, down: Placed, across: Placed, raw_at: tuple[int, int]
     ) -> Image:
-        """Compute the correction for the kept pixels: G (y - H x), and that of finer detail.
+        """Compute the correction for the kept pixels: what smoothing changes, G (y - H x), and that
+        of finer detail.
 
         y counts less the amount that clipping the noise at zero adds. Blocks with a missing or
         saturated pixel within NEAR_PX are excluded. Pixels around them get the correction of the
@@ -189,7 +198,8 @@ class Consistency:
         """
         missing = np.isnan(restored)
         any_missing = bool(missing.any())
-        finite = np.where(missing, np.float32(0), restored) if any_missing else restored
+        smooth = self.smoothing.smoothed(restored)
+        finite = np.where(missing, np.float32(0), smooth) if any_missing else smooth
         origin = down.start, across.start
         near_pixels = extend(finite, (down, across), origin, NEAR_PX)
         raw_pixels = extend(raw, (down, across), raw_at, 0)
@@ -218,7 +228,11 @@ class Consistency:
             fine = self.detail.correction(raw_pixels, near_pixels, down, across)
             # Next to a block that does not count the finer residual is no noise, and may be NaN.
             change += fine if share is None else np.where(share == 1, fine, np.float32(0))
-        return change
+        kept = tuple(
+            slice(side.keep_start - side.start, side.keep_stop - side.start)
+            for side in (down, across)
+        )
+        return change + np.where(missing, np.float32(0), smooth - restored)[kept]
 
     def _far(
         self, finite: Image, missing: NDArray[np.bool_] | None, down: Placed, across: Placed
