@@ -88,8 +88,9 @@ class Board(TargetProfile):
             ModelError: the network is float, damaged, or was not quantised under a DPU's rules
                 here.
             MachineError: `out` is not a folder.
-            OptionError: the sensor would change nothing, `tile` is not a side of 16 to 8192 pixels,
-                or the board has neither a DPU nor an NPU.
+            OptionError: the sensor would change nothing, `tile` is not a side of 16 to 8192 pixels
+                that leaves room between two halos of the network, or the board has neither a DPU
+                nor an NPU.
             ProfileError: there is no such sensor.
         """
         _require_tile(tile)

@@ -6,13 +6,12 @@
 Images are float32 (C, H, W) as the network reads them, in [0, 1] unless host.json has other
 factors. The script needs NumPy, host.json and onnxruntime; a board needs other runners in `cores`.
 
-1. Each tile goes to one core or several (`factors`, `exposed`): core.onnx restores the tile as it
-   is. Where host.json has exposures, core-x4.onnx restores dark pixels, multiplied by 4, and so on.
+1. Each tile goes to core.onnx. Where host.json has exposures, core-x4.onnx restores dark pixels,
+   multiplied by 4, and so on (`factors`, `exposed`).
 2. Around a core, the host encodes the tile as int8 planes, and adds the result to it (`restored`).
-3. After the last tile, the consistency step (`consistent`) smooths the dark and makes the restored
-   image agree with the raw one at low spatial frequencies, if host.json has its weights.
-4. Then the self-check (`judged`) blurs the result as the sensor blurs and compares it with the raw
-   image, block by block. restored-check.npy holds its two figures of each block.
+3. After the last tile, the consistency step (`consistent`) smooths the dark and corrects low spatial
+   frequencies.
+4. Then the self-check (`judged`) writes two figures of each block into restored-check.npy.
 5. Each core restores a drawn tile (`known_tile`), to be compared with known.json (`--learn`).
 """
 
@@ -334,12 +333,12 @@ def interpolated(blocks: np.ndarray, shape: tuple[int, ...], side: int = BLOCK) 
     return blocks
 
 
-def known_tile(runs: dict[float, Any], channels: int, learn: bool) -> None:
+def known_tile(runs: dict[float, Any], learn: bool) -> None:
     """Restore a drawn tile by each core. Another checksum than in known.json shows a flip."""
     path = HERE / "known.json"
     if not learn and not path.exists():
         return
-    size = (1, channels, S["tile_px"], S["tile_px"])
+    size = (1, S["channels"], S["tile_px"], S["tile_px"])
     shares = np.random.default_rng(0).uniform(S["lowest_dn"] / 4095, 1, size)
     tile = (shares / np.array(S["input_factors"])[:, None, None]).astype(F)
     crcs = {f"{f:g}": zlib.crc32(exposed(f, tile, run).tobytes()) for f, run in runs.items()}
@@ -366,11 +365,14 @@ def main(source: str, target: str, runs: dict[float, Any], learn: bool) -> None:
     image = np.load(source).astype(F)
     t = S["tile_px"]
     r = S["scale"]
-    if image.ndim != 3 or min(image.shape[1:]) < t or not np.isfinite(image).all():
+    whole = image.ndim == 3 and len(image) == S["channels"] and min(image.shape[1:]) >= t
+    if not whole or not np.isfinite(image).all():
         sys.exit(
-            f"{source} must hold finite values (C, H, W) of at least {t} x {t} pixels, got "
-            f"shape {image.shape}."
+            f"{source} must hold finite values ({S['channels']}, H, W) of at least {t} x {t} "
+            f"pixels, got shape {image.shape}."
         )
+    if np.median(image * np.array(S["input_factors"], F)[:, None, None]) > 1:
+        sys.exit(f"{source} is mostly above full scale. Divide its values by full scale.")
     wide = np.pad(image, [(0, 0)] + [(0, -n % S["alignment_px"]) for n in image.shape[1:]], "edge")
     down, across = (spans(n, t, S["halo_px"]) for n in wide.shape[1:])
     out = np.empty((S["bands"], *(n * r for n in wide.shape[1:])), F)
@@ -382,7 +384,6 @@ def main(source: str, target: str, runs: dict[float, Any], learn: bool) -> None:
             result = exposed(factor, tile, runs[factor])[0]
             pixels = result[:, (top - y) * r : (bottom - y) * r, (left - x) * r : (right - x) * r]
             np.copyto(place, pixels, where=choice == factor)
-    # The image was extended to the lattice, and the result is cut back.
     out = out[:, : image.shape[1] * r, : image.shape[2] * r]
     if S["consistency"]:
         out = np.stack([consistent(raw, np.clip(x, 0, F(1))) for raw, x in zip(image, out)])  # noqa: B905 - as above
@@ -391,7 +392,7 @@ def main(source: str, target: str, runs: dict[float, Any], learn: bool) -> None:
         blocks = np.stack([judged(raw, x) for raw, x in zip(image, out)])  # noqa: B905 - as above
         np.save(Path(target).with_name(f"{Path(target).stem}-check.npy"), blocks)
         sys.stdout.write(report(blocks))
-    known_tile(runs, len(image), learn)
+    known_tile(runs, learn)
 
 
 def cores() -> dict[float, Any]:

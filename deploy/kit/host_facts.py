@@ -22,6 +22,7 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import CORRECTION
+from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.restoration.steps import keeps_pixels
 
 Facts = dict[str, object]
@@ -50,7 +51,7 @@ def host_facts(
         of this network.
 
     Raises:
-        OptionError: the sensor would change nothing.
+        OptionError: the sensor would change nothing, or a tile has no room between its halos.
     """
     facts = host_constants(network, tile_px)
     step = consistency_facts(network, sensor) if sensor is not None and facts is not None else None
@@ -92,6 +93,9 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
     Returns:
         The constants by name, as host.json has them; None if the core does not read encoded pixels,
         or if pixels are rearranged in another way than in `host.py`.
+
+    Raises:
+        OptionError: a tile has no room between its halos.
     """
     core = read_core(network.model)
     part = core.host_part
@@ -110,6 +114,7 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
             return None
         blocks[name] = moves[0].block if moves else 1
     tiling = network.tiling
+    _require_room(tile_px, tiling)
     return {
         **blocks,
         **encoding,
@@ -124,8 +129,21 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
         "halo_px": tiling.halo_px,
         "alignment_px": tiling.alignment_px,
         "scale": int(tiling.scale),
+        "channels": tiling.channels_in,
         "bands": tiling.channels_out,
     }
+
+
+def _require_room(tile_px: int, tiling: Tiling) -> None:
+    """Raise OptionError if `host.py` could not cut an image into tiles of this side."""
+    smallest_px = 2 * tiling.halo_px + tiling.alignment_px
+    # Between two halos a tile must retain pixels, and it must begin where the strides repeat.
+    if tile_px < smallest_px or tile_px % tiling.alignment_px:
+        multiple = f"a multiple of {tiling.alignment_px} px and " if tiling.alignment_px > 1 else ""
+        raise OptionError(
+            f"`tile` must be {multiple}at least {smallest_px} px, because the network needs a halo "
+            f"of {tiling.halo_px} px on each side, got {tile_px} px. Choose another."
+        )
 
 
 def self_check_facts(sensor: Sensor) -> Facts:

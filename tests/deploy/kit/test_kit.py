@@ -137,7 +137,7 @@ def by_host(folder: Path, image: np.ndarray) -> np.ndarray:
     return np.asarray(np.load(folder / "out.npy")[0])
 
 
-@pytest.mark.parametrize("shape", [(1, 203, 95), (96, 96)])
+@pytest.mark.parametrize("shape", [(1, 203, 95), (96, 96), (2, 96, 96)])
 def test_the_host_part_refuses_what_it_cannot_restore(
     shape: tuple[int, ...], kit: Path, tmp_path: Path
 ) -> None:
@@ -150,6 +150,16 @@ def test_the_host_part_refuses_what_it_cannot_restore(
     result = subprocess.run(command, cwd=kit, check=False, capture_output=True, text=True)
     assert result.returncode == 1
     assert result.stderr.splitlines()[-1].endswith(f"at least 96 x 96 pixels, got shape {shape}.")
+    assert not (tmp_path / "out.npy").exists()
+
+
+def test_digital_numbers_in_the_place_of_shares_are_refused(kit: Path, tmp_path: Path) -> None:
+    """They would all be restored to white."""
+    np.save(tmp_path / "image.npy", np.full((1, 96, 96), 900, np.uint16))
+    command = [sys.executable, "host.py", str(tmp_path / "image.npy"), str(tmp_path / "out.npy")]
+    result = subprocess.run(command, cwd=kit, check=False, capture_output=True, text=True)
+    assert result.returncode == 1
+    assert result.stderr.endswith("mostly above full scale. Divide its values by full scale.\n")
     assert not (tmp_path / "out.npy").exists()
 
 
@@ -241,7 +251,7 @@ def test_a_flipped_weight_of_any_core_shows_in_the_known_tile(kit: Path) -> None
     host = runpy.run_path(str(kit / "host.py"))
     runs = host["cores"]()
     for learn in (False, True, False):
-        host["known_tile"](runs, 1, learn)
+        host["known_tile"](runs, learn)
     core = onnx.load(kit / "core-x4.onnx")
     weights = max(core.graph.initializer, key=lambda tensor: len(tensor.raw_data))
     content = bytearray(weights.raw_data)
@@ -250,7 +260,7 @@ def test_a_flipped_weight_of_any_core_shows_in_the_known_tile(kit: Path) -> None
     session = open_session(core)
     runs[4.0] = lambda planes: tensors_of(session, None, planes)[0]
     with pytest.raises(SystemExit, match="restored otherwise by x4, whose weights"):
-        host["known_tile"](runs, 1, False)
+        host["known_tile"](runs, False)
 
 
 def test_a_sensor_that_does_not_exist_or_changes_nothing_is_one_sentence(tmp_path: Path) -> None:
@@ -283,6 +293,19 @@ def test_a_host_alone_has_no_kit_and_no_golden_vectors(tmp_path: Path) -> None:
 def test_a_tile_that_no_core_has_is_refused(tile: Any, tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="`tile` must be a whole number of 16 to 8192 px"):
         bd.Board.load("vck190").kit(NAME, tmp_path / "kit", tile=tile)
+    assert not (tmp_path / "kit").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "tile", "rule"),
+    [(NAME, 28, "at least 29 px"), ("unet", 48, "a multiple of 4 px and at least 52 px")],
+)
+def test_a_tile_without_room_between_its_halos_is_refused(
+    name: str, tile: int, rule: str, tmp_path: Path
+) -> None:
+    """`host.py` would leave most of the image unwritten."""
+    with pytest.raises(OptionError, match=f"`tile` must be {rule}, .* got {tile} px"):
+        bd.Board.load("vck190").kit(network(name), tmp_path / "kit", tile=tile)
     assert not (tmp_path / "kit").exists()
 
 
@@ -326,7 +349,7 @@ def test_a_record_says_what_a_network_is_and_what_was_checked(tmp_path: Path) ->
 
 def test_of_a_users_network_nothing_is_made_up(tmp_path: Path) -> None:
     """Facts that are unknown of a user's network are recorded as unknown."""
-    folder = bd.Board.load("zcu102").kit(network("unet"), tmp_path / "kit", tile=32, record=True)
+    folder = bd.Board.load("zcu102").kit(network("unet"), tmp_path / "kit", tile=64, record=True)
     record = json.loads((folder / "record" / RECORD[0]).read_text(encoding="utf-8"))
     assert record["results"]["command"] == "check"
     for fact in ("training", "licence", "weights_sha256", "sensors_in_range"):
