@@ -41,6 +41,8 @@ def main() -> int:
     """
     options = arguments()
     try:
+        # A file that cannot take the run is refused before minutes are spent on it.
+        read_runs(options.out)
         entry = measure(options)
         write_entry(entry, options.out)
     except (OSError, RuntimeError, ValueError) as error:
@@ -68,14 +70,22 @@ def arguments() -> argparse.Namespace:
     )
     add("--configuration", default="C32B3", help="DPU in the board's bitstream, C32B1 to C64B5")
     sides = "tile side in image pixels; if none, that of host.json next to the model, or 640"
-    add("--tile", type=int, help=sides)
-    add("--batch", type=int, default=1, help="tiles in one call")
-    add("--frames", type=int, default=300, help="tiles to time, after a warm-up")
-    add("--threads", type=int, default=1, help="calls in flight; try 1, 2, 3, ... batch handlers")
+    add("--tile", type=count, help=sides)
+    add("--batch", type=count, default=1, help="tiles in one call")
+    add("--frames", type=count, default=300, help="tiles to time, after a warm-up")
+    add("--threads", type=count, default=1, help="calls in flight; try 1, 2, 3, ... batch handlers")
     power = "microwatts, such as hwmon's power1_input; repeatable, summed"
     add("--power-file", type=Path, action="append", default=[], help=power)
     add("--no-compare", action="store_true", help="skip the comparison with the CPU provider")
     return parser.parse_args()
+
+
+def count(text: str) -> int:
+    """Convert an option's text to a whole number of at least 1; argparse names the option."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, got {number}")
+    return number
 
 
 def measure(options: argparse.Namespace) -> dict[str, object]:
@@ -91,10 +101,11 @@ def measure(options: argparse.Namespace) -> dict[str, object]:
         An entry of board.json: the name of the model, the DPU's configuration, the tile side, the
         rate in frames per second, the provider and, if measured, the mean power in W.
     """
-    session = open_session(
-        options.model, options.provider, dict(option.split("=", 1) for option in options.option)
-    )
-    tile_px = options.tile or kit_tile_px(options.model.parent / "host.json")
+    pairs = [option.partition("=") for option in options.option]
+    if not all(sign for _, sign, _ in pairs):
+        raise ValueError(f"--option must be KEY=VALUE, got {' '.join(options.option)}.")
+    tile_px = kit_tile_px(options.model.parent / "host.json", options.tile)
+    session = open_session(options.model, options.provider, {key: value for key, _, value in pairs})
     feed = make_feed(session, options.batch, tile_px)
     if not options.no_compare:
         compare(options.model, session, feed)
@@ -119,11 +130,23 @@ def measure(options: argparse.Namespace) -> dict[str, object]:
     return entry
 
 
-def kit_tile_px(facts: Path) -> int:
-    """Return the tile side in pixels that a kit's host.json states, or 640 without that file."""
+def kit_tile_px(facts: Path, asked_px: int | None) -> int:
+    """Return the tile side in pixels that a kit's host.json states; without that file `asked_px`,
+    or 640.
+
+    Raises:
+        ValueError: the kit was made for another side than `asked_px`.
+    """
     if not facts.is_file():
-        return 640
-    return int(json.loads(facts.read_text(encoding="utf-8"))["tile_px"])
+        return asked_px or 640
+    tile_px = int(json.loads(facts.read_text(encoding="utf-8"))["tile_px"])
+    # The rate would be recorded as that of tiles that never ran.
+    if asked_px not in (None, tile_px):
+        raise ValueError(
+            f"This kit's cores are made for tiles of {tile_px} px, but --tile is {asked_px}. Leave "
+            "--tile out."
+        )
+    return tile_px
 
 
 def open_session(model: Path, provider: str, options: dict[str, str]) -> ort.InferenceSession:
@@ -135,7 +158,8 @@ def open_session(model: Path, provider: str, options: dict[str, str]) -> ort.Inf
         options: the options of the provider, by name.
 
     Raises:
-        ValueError: the provider is not available, or onnxruntime fell back to another.
+        ValueError: the provider is not available, cannot open the file, or onnxruntime fell back
+            to another.
     """
     if provider not in ort.get_available_providers():
         raise ValueError(
@@ -144,7 +168,11 @@ def open_session(model: Path, provider: str, options: dict[str, str]) -> ort.Inf
         )
     if not model.is_file():
         raise ValueError(f"{model}: no such file. Give an ONNX file.")
-    session = ort.InferenceSession(str(model), providers=[provider], provider_options=[options])
+    try:
+        session = ort.InferenceSession(str(model), providers=[provider], provider_options=[options])
+    # onnxruntime raises a class of its own for each status code.
+    except Exception as error:
+        raise ValueError(f"{provider} cannot open {model}: {error}") from error
     if session.get_providers()[0] != provider:
         raise ValueError(
             f"{provider} does not run the model: onnxruntime fell back to "
@@ -267,17 +295,25 @@ def throughput(stamps: list[float], batch: int) -> float:
 
 
 def write_entry(entry: dict[str, object], path: Path) -> None:
-    """Add an entry to the list in a JSON file, which is created if it does not exist.
+    """Add an entry to the list in a JSON file, which is created if it does not exist."""
+    path.write_text(json.dumps([*read_runs(path), entry], indent=1) + "\n", encoding="utf-8")
+
+
+def read_runs(path: Path) -> list[object]:
+    """Read the list in a JSON file; an absent file has an empty one.
 
     Raises:
-        ValueError: the file does not contain a list.
+        ValueError: the file does not contain a list, or its folder does not exist.
     """
-    runs = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+    if not path.parent.is_dir():
+        raise ValueError(f"{path.parent} is not a folder. Give another --out.")
+    try:
+        runs = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+    except ValueError:
+        runs = None
     if not isinstance(runs, list):
-        raise ValueError(
-            f"{path} must be a JSON list of runs, got {type(runs).__name__}. Give another --out."
-        )
-    path.write_text(json.dumps([*runs, entry], indent=1) + "\n", encoding="utf-8")
+        raise ValueError(f"{path} must be a JSON list of runs. Give another --out.")
+    return runs
 
 
 if __name__ == "__main__":

@@ -56,6 +56,8 @@ def test_the_core_of_a_kit_is_measured_at_its_own_size(
     table = bd.bench("convbeers-half-xs-int8", tile=64, measured=out, size="700x600")
     assert any("your runs" in row.figures for row in table.rows)
     assert run(monkeypatch, kit / "core.onnx", *provider, "--batch", 2) == 2
+    # The rate of tiles of 64 px must not be recorded as that of 128 px.
+    assert run(monkeypatch, kit / "core.onnx", *provider, "--tile", 128) == 2
 
 
 def test_throughput_leaves_the_first_calls_latency_out() -> None:
@@ -69,6 +71,10 @@ def test_throughput_leaves_the_first_calls_latency_out() -> None:
     [
         (("core.onnx",), "VitisAIExecutionProvider"),
         (("none.onnx", "--provider", "CPUExecutionProvider"), "no such file"),
+        (("text.onnx", "--provider", "CPUExecutionProvider"), "cannot open text.onnx"),
+        (("core.onnx", "--option", "level"), "--option must be KEY=VALUE, got level"),
+        (("core.onnx", "--out", "none/board.json"), "none is not a folder"),
+        (("core.onnx", "--out", "text.onnx"), "must be a JSON list of runs"),
         (("core.onnx", "--provider", "CPUExecutionProvider", "--frames", "1"), "--frames"),
     ],
 )
@@ -80,6 +86,7 @@ def test_what_the_owner_can_correct_is_one_sentence(
     word: str,
 ) -> None:
     board_convbeers(tmp_path / "core.onnx", 1, 8)
+    (tmp_path / "text.onnx").write_text("no network", encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     assert run(monkeypatch, *arguments, "--tile", "16") == 2
     assert word in capsys.readouterr().err
