@@ -74,7 +74,8 @@ def stress(
 
     Raises:
         ModelError: a network that cannot be tiled, or a float and an INT8 network that are swapped.
-        OptionError: no such case or stage, or options that do not go together.
+        OptionError: no such case or stage, stages that check nothing of the cases, or options that
+            do not go together.
     """
     options = partial(changed, stress, locals())
     if bit_flips:

@@ -197,8 +197,19 @@ def battery_table(
         stages: the names of the stages, from `STAGES`.
         seed: the seed of the images.
         side_px: the side in pixels of images whose case states no size.
+
+    Raises:
+        OptionError: nothing is checked of these cases at these stages.
     """
     results = run_battery(subject, cases, stages, seed, side_px)
+    reasons = dict.fromkeys(result.reason for result in results if result.reason)
+    # Without a measurement every check would pass.
+    if not any(result.measures for result in results):
+        why = "".join(f" {reason}" for reason in reasons)
+        raise OptionError(
+            f"Nothing is checked of the chosen cases at {', '.join(stages)}."
+            f"{why or ' Choose other `cases` or `stages`.'}"
+        )
     layers = layer_rows(subject)
     failed = [
         f"{result.case.name}, {result.stage}: {result.verdict.removeprefix('FAILED: ')}"
@@ -207,7 +218,13 @@ def battery_table(
     ]
     # A sum that might overflow is a failure, even if no case makes it overflow.
     overflowing = [row.name for row in layers if row.text["can it overflow int32"] != "no"]
-    reasons = dict.fromkeys(result.reason for result in results if result.reason)
+    checks = [Check("failures", len(failed), 0, "result", detail="; ".join(failed))]
+    # A float network alone has no such sums.
+    if layers:
+        detail = ", ".join(overflowing)
+        checks.append(
+            Check("sums that might overflow", len(overflowing), 0, "layer", detail=detail)
+        )
     return Table(
         command="stress",
         inputs=subject.inputs,
@@ -218,16 +235,7 @@ def battery_table(
             *layers,
             *finding_rows(results),
         ),
-        checks=(
-            Check("failures", len(failed), 0, "result", detail="; ".join(failed)),
-            Check(
-                "sums that might overflow",
-                len(overflowing),
-                0,
-                "layer",
-                detail=", ".join(overflowing),
-            ),
-        ),
+        checks=tuple(checks),
         notes=tuple(f"not checked: {reason}" for reason in reasons),
         headings=HEADINGS,
         captions={HEADINGS["battery"]: LEGEND},

@@ -268,11 +268,14 @@ def _curve_row(name: str, draws: Sequence[Injection], kind: str) -> Row:
             statistics.mean(values), "dB", source, (min(values), max(values))
         )
     costly = [draw.detected for draw in draws if draw.costly]
-    about = f"{len(costly)} of {len(draws)} {kind} that lost more than {COSTLY_DB:g} dB unguarded"
+    about = (
+        f"{len(costly)} of {len(draws)} {kind} lost more than {COSTLY_DB:g} dB unguarded, in a "
+        "patch that the self-check can decide"
+    )
     if costly:
         figures["found by the self-check"] = measured(100 * float(np.mean(costly)), "%", about)
     elif name != "none":
-        figures["found by the self-check"] = unavailable("%", f"{about}: none to find")
+        figures["found by the self-check"] = unavailable("%", about)
     return Row("bit flips", name, figures)
 
 
