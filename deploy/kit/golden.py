@@ -252,7 +252,8 @@ def read_golden(folder: Path) -> Golden:
 
     Raises:
         OptionError: the folder has no index, a damaged one, or other numbers than were written.
-        ImageError: the inputs of a case are not int8 arrays of the network's channels.
+        ImageError: a file is no array, or the inputs of a case are not int8 arrays of the network's
+            channels.
     """
     digests, half_even = _index(folder / INDEX)
     network = Network.load(folder / NETWORK)
@@ -270,8 +271,12 @@ def read_golden(folder: Path) -> Golden:
                 f"The planes in {folder / case} have the size {times(planes.shape)}, which the "
                 f"network does not accept. {AGAIN}"
             ) from error
+        # A board's engineer may use any of the files, so none may differ from its digest.
         wrong = [
-            file for name, file in names.items() if files.get(file) != _digest(cases[case][name])
+            file
+            for name, file in names.items()
+            if files.get(file) != _digest(cases[case][name])
+            or _differs(folder / case / file, cases[case][name])
         ]
         if wrong:
             raise OptionError(
@@ -279,6 +284,13 @@ def read_golden(folder: Path) -> Golden:
                 f"{case}/{printable(wrong[0])} has other numbers. {AGAIN}"
             )
     return Golden(core, half_even, cases, network.input)
+
+
+def _differs(path: Path, values: np.ndarray) -> bool:
+    """Return True if there is a .npy file of that path with other values. Files that were not
+    copied along are not missed, because their values are computed again.
+    """
+    return path.exists() and not np.array_equal(read_array(path), values)
 
 
 AGAIN = "Write the folder again with 'beers-deploy golden'."

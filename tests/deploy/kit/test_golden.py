@@ -261,6 +261,20 @@ def test_an_index_leads_nowhere_else_and_its_claims_are_no_inputs(
     assert "is damaged (the case '../noise')" in refused("golden", tmp_path, "--compare", copied)
 
 
+def test_damaged_vectors_of_any_layer_are_refused_and_absent_ones_are_computed(
+    copied: Path, tmp_path: Path
+) -> None:
+    """The comparison would be right, but an engineer who uses the file elsewhere would not."""
+    shutil.copytree(copied / "noise", tmp_path / "seen" / "noise")
+    *_, last = sorted((copied / "noise").glob("[0-9]*.npy"))
+    np.save(last, np.load(last) ^ 1)
+    assert f"noise/{last.name} has other numbers" in refused(
+        "golden", tmp_path / "seen", "--compare", copied
+    )
+    last.unlink()
+    assert compare_golden(copied, tmp_path / "seen")
+
+
 def test_older_vectors_do_not_stay(copied: Path) -> None:
     stale = copied / "odd" / "99-gone.npy"
     np.save(stale, np.zeros(1))
