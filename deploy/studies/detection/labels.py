@@ -144,12 +144,13 @@ def _labelled_set(files: Sequence[_File], notes: Sequence[str] = ()) -> Labelled
         inside = labelled[areas(labelled.corners) > 0].clipped(*_size_px(one))
         outside += [one.source.name] * (len(labelled) - len(inside))
         images.append((one.image, inside))
-    if not any(len(truth) for _, truth in images):
-        raise OptionError(
-            f"The labels must have at least one object, but they have none on {len(images)} "
-            "images. Check the labels."
-        )
     truths = [truth for _, truth in images]
+    # Without an object that counts there is no recall and no average precision.
+    if all(truth.ignored.all() for truth in truths):
+        raise OptionError(
+            f"The labels must have at least one object that counts, but they have none on "
+            f"{len(images)} images. Check the labels."
+        )
     empty = sum(not len(truth) for truth in truths)
     ignored = sum(int(truth.ignored.sum()) for truth in truths)
     remarks = {
@@ -257,6 +258,8 @@ def _read_coco(labels: Path, folder: Path) -> tuple[list[_File], list[str]]:
                 bool(entry.get("iscrowd", 0)),
             )
             boxes[entry["image_id"]].append(box)
+        if len(boxes) < len(content["images"]):
+            raise ValueError("two images have one id")
         files = [
             _File(
                 path,
@@ -279,10 +282,19 @@ def _read_coco(labels: Path, folder: Path) -> tuple[list[_File], list[str]]:
             f"None of the {listed} images that {labels} lists is in {folder}. Give the folder "
             "that holds them."
         )
+    paths = {one.image for one in files}
+    if len(paths) < len(files):
+        raise OptionError(f"{labels} lists one image of {folder} twice. {CORRECT}")
+    # COCO's names may lead into folders below.
+    there = list(chain.from_iterable(map(list_images, {path.parent for path in paths})))
     absent = listed - len(files)
-    if not absent:
-        return files, []
-    return files, [f"{absent} of {listed} images in {labels.name} are not in the folder."]
+    unlisted = len([path for path in there if path not in paths])
+    remarks = {
+        f"{absent} of {listed} images in {labels.name} are not in the folder.": absent,
+        f"{unlisted} of {len(there)} images in the folder are left out, because {labels.name} does "
+        "not list them.": unlisted,
+    }
+    return files, [text for text, n in remarks.items() if n]
 
 
 def _inside(folder: Path, name: str) -> Path | None:

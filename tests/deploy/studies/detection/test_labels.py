@@ -207,6 +207,33 @@ def test_a_faulty_coco_file_is_refused_by_a_sentence(
     refused(tmp_path, sentence)
 
 
+def test_images_that_coco_does_not_list_are_told_and_one_listed_twice_is_refused(
+    tmp_path: Path,
+) -> None:
+    path = coco(tmp_path) / "labels.json"
+    content = json.loads(path.read_text())
+    image(tmp_path / "00003.png")
+    assert read_labelled(tmp_path).notes == [
+        "1 of 3 images in the folder are left out, because labels.json does not list them."
+    ]
+    first, second = content["images"]
+    for again, sentence in (
+        ({**second, "id": 9}, r"labels\.json lists one image of .* twice"),
+        ({**first, "file_name": "00003.png"}, "two images have one id"),
+    ):
+        path.write_text(json.dumps(content | {"images": [first, second, again]}))
+        refused(tmp_path, sentence)
+
+
+def test_labels_of_which_no_object_counts_are_refused(tmp_path: Path) -> None:
+    path = coco(tmp_path) / "labels.json"
+    content = json.loads(path.read_text())
+    for annotation in content["annotations"]:
+        annotation["iscrowd"] = 1
+    path.write_text(json.dumps(content))
+    refused(tmp_path, "at least one object that counts, but they have none on 2 images")
+
+
 def test_what_coco_lists_and_the_folder_lacks_is_told_and_a_crowd_need_not_be_found(
     tmp_path: Path,
 ) -> None:
