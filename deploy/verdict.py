@@ -82,7 +82,7 @@ def read_document(path: Path) -> dict[str, object]:
         document = read_json(path)
         schema = Draft202012Validator(json.loads(SCHEMA_PATH.read_text(encoding="utf-8")))
         error = next(schema.iter_errors(document), None)
-        fault = "" if error is None else error.message
+        fault = "" if error is None else f"{error.json_path.lstrip('$.')} {error.message}".strip()
     except FileNotFoundError:
         fault = "there is no such file"
     except (OSError, ValueError) as error:
@@ -317,6 +317,8 @@ def judged(
     checks += file_checks(comparison.floating.model, comparison.int8, target, must_describe)
     notes = [*comparison.notes, *_mae_note(result, limits, checks)]
     notes += float_note(comparison.int8.model)
+    if result.metric and limits.metric_loss is None:
+        notes.append(f"not judged: {result.metric} lost, because `limits` sets no 'metric_loss'")
     if not any(check.name == ENCODING for check in checks):
         notes.append(
             f"not checked: {ENCODING}, because the INT8 file does not describe its integers, as a "

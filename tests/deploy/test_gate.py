@@ -275,6 +275,17 @@ def test_samples_without_references_tell_no_loss_and_cannot_keep_a_limit_on_it(
     assert "--samples must have references for the limit 'psnr_drop_db'" in message
 
 
+def test_a_metric_without_a_limit_is_told_to_be_unjudged(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).uniform(0.1, 0.9, (2, 1, 40, 40)).astype(np.float32)
+    np.savez(tmp_path / "s.npz", image=image, reference=image)
+    limits = tmp_path / "limits.toml"
+    command = f"gate {SMALL} --samples {tmp_path / 's.npz'} --metric mae --limits {limits}"
+    note = "not judged: mae lost, because --limits sets no 'metric_loss'"
+    for text, unjudged in (("mae = 0.1\n", True), ("mae = 0.1\nmetric_loss = 0.5\n", False)):
+        limits.write_text(text, encoding="utf-8")
+        assert (note in " ".join(done(command).split())) == unjudged
+
+
 def test_references_that_do_not_fit_are_refused_and_the_sample_is_named(tmp_path: Path) -> None:
     image = np.random.default_rng(0).uniform(0.1, 0.9, (2, 1, 40, 40)).astype(np.float32)
     path = tmp_path / "s.npz"

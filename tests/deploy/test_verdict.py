@@ -65,6 +65,7 @@ def without_mae(content: dict[str, Any]) -> None:
         (failed, "a gate that failed"),
         (another_command, "a document of 'check', not of 'gate'"),
         (without_mae, "has no MAE"),
+        (lambda content: content.update(schema_version=1), "schema_version 2 was expected"),
     ],
 )
 def test_a_document_that_is_no_baseline_is_refused(
