@@ -23,6 +23,7 @@ from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unav
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.restoration.detectors.fault_list import FOUND
 from beers_deploy.restoration.detectors.look import warn_of_detectors
+from beers_deploy.restoration.memory import check_memory, rows_bytes
 from beers_deploy.restoration.plan import Plan, plan_for
 from beers_deploy.restoration.prepare import NetworkPipeline
 from beers_deploy.restoration.radiometry import FullScale, Reading, full_scale_of
@@ -51,10 +52,15 @@ def preview_row(
     Returns:
         A row with the size, the tiles, the predicted times here and on the board, the faults of
         detectors that were found, and where the image lies.
+
+    Raises:
+        MachineError: the memory is too small for the run.
     """
     network = next(iter(pipeline.networks.values()))
     with open_raster(image, reading.force) as source:
         raster = source.raster
+        plan = plan_for(network, raster.shape, pipeline.tiles)
+        check_memory(rows_bytes(source, plan), reading.memory_bytes)
         scale = header_scale(image.name, raster, reading)
         check = SensorCheck()
         # Where full scale is open, no pixel counts as saturated.
@@ -62,7 +68,6 @@ def preview_row(
         detectors = warn_of_detectors(source, saturation, reading.fix_detectors != FOUND)
         if isinstance(scale, FullScale):
             check = checked_sensor(source, reading.sensors, scale.value, str(image), reading.strict)
-    plan = plan_for(network, raster.shape, pipeline.tiles)
     figures = {
         "width": measured(raster.width_px, "px", HEADER),
         "height": measured(raster.height_px, "px", HEADER),

@@ -11,6 +11,7 @@ import tifffile
 
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.performance.dry_run import preview_row
+from beers_deploy.profiles.errors import MachineError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.restoration.plan import Tiles
@@ -108,3 +109,10 @@ def test_an_output_that_the_run_refuses_is_refused_in_the_same_words(
     (tmp_path / "old.tif").write_bytes(b"old")
     command = f"restore {tmp_path}/raw.tif {tmp_path / name} --network {model} --quiet"
     assert done(f"{command} --dry-run", code=2) == done(command, code=2)
+
+
+def test_a_plan_that_the_memory_does_not_allow_is_refused(model: Path, tmp_path: Path) -> None:
+    """The run would refuse it too, and a plan that cannot be kept is none."""
+    tifffile.imwrite(tmp_path / "in.tif", np.ones((90, 70), np.uint16))
+    with pytest.raises(MachineError, match=r"The run may use .* of memory"):
+        restore(tmp_path / "in.tif", network=str(model), memory=0.001, dry_run=True)
