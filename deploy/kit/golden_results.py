@@ -110,12 +110,12 @@ def _results(golden: Golden, folder: Path) -> Results:
 
 def _integers(path: Path, shape: tuple[int, ...], frac_bits: int) -> np.ndarray:
     """Read a tensor that a board wrote, as int16 (N, C, H, W)."""
-    values = read_array(path)
-    if values.shape != shape and values.ndim == len(shape):
-        values = np.moveaxis(values, -1, 1)
+    read = read_array(path)
+    channels_last = read.shape != shape and read.ndim == len(shape)
+    values = np.moveaxis(read, -1, 1) if channels_last else read
     if values.shape != shape:
         raise ImageError(
-            f"{path} must have the shape {shape}, got {values.shape}. Write the whole tensor, for "
+            f"{path} must have the shape {shape}, got {read.shape}. Write the whole tensor, for "
             "the tile of the golden vectors."
         )
     if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
