@@ -11,6 +11,7 @@ import numpy as np
 from beers_deploy.conditioned_file import to_run_on
 from beers_deploy.dpu.board import device_of
 from beers_deploy.dpu.checker.table import check_network
+from beers_deploy.kit import RECORD
 from beers_deploy.kit.golden import PICTURE, save_array, write_golden
 from beers_deploy.kit.host_facts import host_facts
 from beers_deploy.kit.record import require_library, write_record
@@ -109,8 +110,10 @@ class Board(TargetProfile):
         core = network.core(self, tile)
         exposed = {} if profile is None else network.exposures
         facts = host_facts(network, tile, profile, exposed)
-        # What an earlier kit in this folder knew of its cores would be wrong of these.
-        for older in (*folder.glob("core-x*.onnx"), folder / "known.json"):
+        # What an earlier kit in this folder states of its cores would be wrong of these.
+        records = [folder / "record" / name for name in RECORD]
+        others = [folder / name for name in ("known.json", "host.json", "host.py")]
+        for older in (*folder.glob("core-x*.onnx"), *others, *records):
             older.unlink(missing_ok=True)
         core.save(folder / "core.onnx")
         for factor, other in exposed.items():

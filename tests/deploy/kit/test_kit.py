@@ -309,6 +309,20 @@ def test_a_tile_without_room_between_its_halos_is_refused(
     assert not (tmp_path / "kit").exists()
 
 
+def test_nothing_of_an_earlier_kit_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its facts and its record would be read as those of the new cores."""
+    board = bd.Board.load("vck190")
+    folder = board.kit(NAME, tmp_path / "kit", tile=TILE_PX, sensor="pleiades-degraded")
+    (folder / "record").mkdir()
+    for name in ("known.json", f"record/{RECORD[0]}"):
+        (folder / name).write_text("{}", encoding="utf-8")
+    # A network whose host part host.py cannot compute.
+    monkeypatch.setattr("beers_deploy.kit.board.host_facts", lambda *_: None)
+    board.kit(network("unet"), folder, tile=TILE_PX)
+    names = {path.name for path in folder.rglob("*")}
+    assert not names & {"known.json", "host.json", "host.py", "core-x4.onnx", RECORD[0]}
+
+
 def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "kit").write_text("mine", encoding="utf-8")
     with pytest.raises(MachineError, match=r"kit is not a folder\. Choose another path"):
