@@ -91,7 +91,7 @@ def read_labelled(
     where = labels or _labels_near(images)
     if where.suffix.lower() == ".json":
         return _labelled_set(*_read_coco(where, images))
-    return _labelled_set(_read_each(list_images(images), where))
+    return _labelled_set(*_read_each(list_images(images), where))
 
 
 def _labels_near(folder: Path) -> Path:
@@ -109,13 +109,20 @@ def _labels_near(folder: Path) -> Path:
     return json_files[0]
 
 
-def _read_each(images: Sequence[Path], where: Path) -> list[_File]:
+def _read_each(images: Sequence[Path], where: Path) -> tuple[list[_File], list[str]]:
+    """Read the labels of every image. Also return a sentence about labels without an image."""
     if not where.is_dir():
         raise OptionError(f"{where} is no folder of VOC labels and no .json file. Give the labels.")
     names_there = {path.name for path in where.iterdir()}
     absent = [f"{image.stem}.xml" for image in images if f"{image.stem}.xml" not in names_there]
     _require_all(absent, len(images), where)
-    return [_read_voc(image, where / f"{image.stem}.xml") for image in images]
+    files = [_read_voc(image, where / f"{image.stem}.xml") for image in images]
+    labels = [name for name in names_there if name.lower().endswith(".xml")]
+    stems = {image.stem for image in images}
+    unused = sum(Path(name).stem not in stems for name in labels)
+    if not unused:
+        return files, []
+    return files, [f"{unused} of {len(labels)} files of labels in {where} are of no image."]
 
 
 def _require_all(absent: Sequence[str], count: int, folder: Path) -> None:

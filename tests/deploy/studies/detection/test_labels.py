@@ -207,6 +207,13 @@ def test_a_faulty_coco_file_is_refused_by_a_sentence(
     refused(tmp_path, sentence)
 
 
+def test_files_of_labels_without_an_image_are_told(tmp_path: Path) -> None:
+    text(voc(tmp_path) / "00003.xml", SHIP)
+    assert read_labelled(tmp_path).notes == [
+        f"1 of 3 files of labels in {tmp_path} are of no image."
+    ]
+
+
 def test_images_that_coco_does_not_list_are_told_and_one_listed_twice_is_refused(
     tmp_path: Path,
 ) -> None:
