@@ -92,6 +92,17 @@ class PythonOnly:
     """Marks a parameter that no command has."""
 
 
+@dataclass(frozen=True)
+class Wider:
+    """Marks a parameter that has further types in Python, such as arrays, which the verb checks.
+
+    Attributes:
+        names: whether the only further type is a list of texts.
+    """
+
+    names: bool = False
+
+
 def network_names() -> list[str]:
     """Return the names of the shipped networks, in float32 and in INT8."""
     names = shipped_names()
@@ -147,24 +158,28 @@ if TYPE_CHECKING:
     Steps: TypeAlias = int | str
     Names: TypeAlias = str | Sequence[str]
     Edges: TypeAlias = str | Sequence[str]
-    Effects: TypeAlias = Sequence[str]
+    Effects: TypeAlias = str | Sequence[str]
     Factors: TypeAlias = str | Sequence[float]
     Mtf: TypeAlias = str | float | tuple[float, float]
     InputRange: TypeAlias = str | Sequence[float] | Sequence[tuple[float, float]]
 else:
-    InputPath = LimitsLike = Samples = Image = Pairs = Path
+    InputPath = Path
+    LimitsLike = Samples = Image = Pairs = Annotated[Path, Wider()]
     OutputFile = Annotated[Path, Written()]
-    InputPaths = Images = Sequence[Path]
+    InputPaths = Sequence[Path]
+    Images = Annotated[Sequence[Path], Wider()]
     LabelledFolder = Annotated[Path, Labelled()]
     Edges = Effects = Sequence[str]
     RequiredFile = Annotated[Path, Written(required=True)]
     OutputFolder = Annotated[Path, Written(folder=True)]
     VerdictFile = Annotated[Path, Written(verdict=True)]
     VerdictFolder = Annotated[Path, Written(folder=True, verdict=True)]
-    NetworkLike = Networks = ShippedOrFile = Annotated[str, Completed(network_names)]
-    SensorLike = BandSensors = Annotated[str, Completed(sensor_names)]
+    NetworkLike = Networks = Annotated[str, Completed(network_names), Wider()]
+    ShippedOrFile = Annotated[str, Completed(network_names), Wider()]
+    SensorLike = BandSensors = Annotated[str, Completed(sensor_names), Wider()]
     ProfileName = Annotated[str, Completed(profile_names)]
-    TargetLike = Targets = Annotated[str, Completed(target_names, listed=True)]
+    TargetLike = Targets = Annotated[str, Completed(target_names, listed=True), Wider()]
     Progress = Annotated[object, PythonOnly()]
-    Halo = Tiles = Size = Steps = Names = Factors = Methods = Mtf = str
-    InputRange = str
+    Halo = Tiles = Size = Steps = Factors = Methods = Mtf = Annotated[str, Wider()]
+    Names = Annotated[str, Wider(names=True)]
+    InputRange = Annotated[str, Wider()]

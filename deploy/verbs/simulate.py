@@ -130,7 +130,8 @@ def simulate(
     usual, patch_px = (SENSOR, None) if preset is None else PRESETS[preset]
     call = None if scene is None else SceneCall.load(os.fspath(scene))
     own = Sensor.load(sensor or usual)
-    degraded = calling_for(own, call, with_, without)
+    added, removed = ([n] if isinstance(n, str) else n for n in (with_, without))
+    degraded = calling_for(own, call, added, removed)
     scale = call.radiance_scale.low if call else 1.0
     if out is None and not explain:
         refuse_without("`out`", **options("preset", "patch", "tolerance"))
@@ -143,7 +144,7 @@ def simulate(
         _files(images), degraded, reference, oversampling, patch or patch_px, scale, seed, tolerance
     )
     if out is None:
-        return _decisions(recipe, origins(own, call, with_, without))
+        return _decisions(recipe, origins(own, call, added, removed))
     return _write(recipe, Path(out), workers, scheduler, resume)
 
 

@@ -3,19 +3,20 @@
 import math
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import wraps
 from inspect import Parameter, signature
 from itertools import product
+from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar, cast, get_args, get_origin
 
 from annotated_types import Interval
 
 from beers_deploy.profiles.errors import BeersError, OptionError, missing_extra, printable
-from beers_deploy.verbs.parameters import Beside, Holds, InputPath, Labelled, Written
+from beers_deploy.verbs.parameters import Beside, Holds, InputPath, Labelled, Wider, Written
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -77,38 +78,53 @@ def require_allowed(parameter: Parameter, value: object) -> None:
 
     Args:
         parameter: annotated with its type, and perhaps with an `Interval` or a `Literal`.
-        value: what was given; None and the default are always allowed.
+        value: what was given; the default is always allowed.
     """
     name = parameter.name
     if isinstance(value, str) and value == "":
         raise OptionError(f"`{name}` is empty. Give a value, or leave it out.")
-    if value is None or value is parameter.default:
-        return
     parts = list(parts_of(parameter.annotation))
-    _require_type(name, value, parts)
+    if value is parameter.default or (value is None and type(None) in parts):
+        return
+    _require_text(name, value, parts)
+    # The text "no" would count as True.
+    if bool in parts and isinstance(value, str):
+        raise OptionError(f"`{name}` must be True or False, got {printable(repr(value))}.")
+    number = _number(name, value) if {int, float}.intersection(parts) else None
+    if number is not None and float not in parts and not number.is_integer():
+        raise OptionError(f"`{name}` must be an integer, got {printable(repr(value))}.")
     for part in parts:
-        if isinstance(part, Interval) and isinstance(value, int | float):
-            _require_inside(name, value, part)
+        if isinstance(part, Interval) and number is not None:
+            _require_inside(name, number, part)
         if get_origin(part) is Literal and value not in get_args(part):
             names = ", ".join(map(repr, get_args(part)))
             raise OptionError(f"`{name}` must be one of {names}, got {value!r}.")
 
 
-def _require_type(name: str, value: object, parts: list[Any]) -> None:
-    """Raise OptionError if a switch is given as text, or if a number is no number of its type."""
-    # The text "no" would count as True.
-    if bool in parts and isinstance(value, str):
-        raise OptionError(f"`{name}` must be True or False, got {printable(repr(value))}.")
-    if not {int, float}.intersection(parts):
+def _require_text(name: str, value: object, parts: list[Any]) -> None:
+    """Raise OptionError if a text or a path, or one of several, has another type."""
+    wider = next((part for part in parts if isinstance(part, Wider)), None)
+    if (wider and not wider.names) or not {str, Path}.intersection(parts):
         return
+    several = wider is not None or any(get_origin(part) is Sequence for part in parts)
+    each = value if several and isinstance(value, list | tuple) else [value]
+    kinds = (str, os.PathLike) if Path in parts else (str,)
+    if all(isinstance(one, kinds) for one in each):
+        return
+    expected = "a path" if Path in parts else "a text"
+    if several:
+        expected += ", or a list of them"
+    raise OptionError(f"`{name}` must be {expected}, got {printable(repr(value))}.")
+
+
+def _number(name: str, value: object) -> float:
+    """Return a number of Python or NumPy as a float, or raise OptionError."""
     # float() would read text, and would count True as 1.
-    given = None if isinstance(value, str | bool) else value
+    given = value if isinstance(value, Real) and not isinstance(value, bool) else None
     try:
-        number = float(cast(float, given))
-    except (TypeError, ValueError, OverflowError) as error:
+        return float(cast(float, given))
+    except (TypeError, OverflowError) as error:
         raise OptionError(f"`{name}` must be one number, got {printable(repr(value))}.") from error
-    if float not in parts and not number.is_integer():
-        raise OptionError(f"`{name}` must be an integer, got {printable(repr(value))}.")
 
 
 def _require_inside(name: str, value: float, interval: Interval) -> None:
@@ -145,12 +161,14 @@ def paths_of(function: Callable[..., Any], arguments: Mapping[str, Any]) -> Path
     paths = Paths([], [], [], [])
     for name, value in arguments.items():
         written = marker(parameters[name], Written)
+        is_path = isinstance(value, str | os.PathLike)
         if written is None:
             paths.inputs.extend(_paths_in(value))
-            if value is not None and marker(parameters[name], Labelled) is not None:
+            if is_path and marker(parameters[name], Labelled) is not None:
                 below = Path(value).rglob("*")
                 paths.inputs.extend(path for path in below if path.suffix.lower() in LABELS)
-        elif value is not None:
+        # Anything else is refused afterwards, when older verdicts are deleted.
+        elif is_path:
             holds = marker(parameters[name], Holds)
             files = [Path(value)] if holds is None else [Path(value) / f for f in holds.files]
             beside = marker(parameters[name], Beside)
@@ -284,6 +302,9 @@ def recorded(arguments: Mapping[str, object]) -> dict[str, object]:
 def _recorded(value: object) -> object:
     if isinstance(value, str | int | float | bool | type(None)):
         return value
+    # A number of NumPy is none of JSON.
+    if isinstance(value, Real):
+        return float(value)
     if isinstance(value, os.PathLike):
         return os.fspath(value)
     if isinstance(value, Mapping):

@@ -4,6 +4,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from inspect import Parameter
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from beers_deploy.cli.commands import COMMANDS, app
-from beers_deploy.profiles.errors import BeersError
+from beers_deploy.profiles.errors import BeersError, OptionError
 from beers_deploy.verbs.restore import restore
 from tests.deploy.verb_parameters import existing, options
 
@@ -174,6 +175,9 @@ def test_a_combination_is_refused(
         ({"threads": 1.5}, "`threads` must be an integer, got 1.5"),
         ({"tile": True}, "`tile` must be one number, got True"),
         ({"strict": "no"}, "`strict` must be True or False, got 'no'"),
+        ({"tile": np.int64(7)}, "`tile` must be a finite number of at least 16, got 7"),
+        ({"full_scale": np.zeros(1)}, "`full_scale` must be one number"),
+        ({"compression": None}, "`compression` must be one of"),
         ({"sensor": 5}, "A sensor must be a Sensor, a name or the path"),
     ],
     ids=str,
@@ -183,6 +187,26 @@ def test_a_value_of_another_type_is_refused_in_one_sentence(
 ) -> None:
     with pytest.raises(BeersError, match=re.escape(words)):
         restore(np.full((20, 30), 900, np.uint16), network="convbeers-xs", **value)  # type: ignore[arg-type]
+
+
+WRONG_TYPES = [5, 2.5, {"a": 1}, [5], [None], ((1, 2),), np.zeros((2, 2)), object()]
+"""Values that are neither a text nor a path, nor a list of them."""
+
+
+@pytest.mark.parametrize("value", WRONG_TYPES, ids=repr)
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_a_text_or_path_of_another_type_is_refused(name: str, value: object) -> None:
+    names = ("lpips", "recipe", "scene", "with_", "edge", "cases", "need", "scheduler", "out")
+    asked = [option for option in names if option in options(name)]
+    for option in asked:
+        function = COMMANDS[name].verb
+        required = {
+            other.name: "a.tif"
+            for other in options(name).values()
+            if other.parameter.default is Parameter.empty
+        }
+        with pytest.raises(OptionError, match=f"`{option}` must be a (path|text)"):
+            function(**{**required, option: value})
 
 
 @pytest.mark.parametrize("kind", [np.uint16, np.float32])
