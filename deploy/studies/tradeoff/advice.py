@@ -33,6 +33,8 @@ NAMES: dict[str, tuple[str, str]] = {
     **{key.removeprefix("board "): (key, unit) for key, unit in UNITS.items()},
 }
 """The names that a user may write: the figure that each one stands for, and its unit."""
+BETTER_LARGER = ("psnr", "ssim", "throughput", "efficiency")
+"""Names of figures that a user limits from below; all others are limited from above."""
 BARE_UNITS = ("ratio", "distance")
 
 WORTH_A_WORD_DB = 0.002
@@ -117,6 +119,12 @@ def _parse(option: str, text: str) -> Constraint:
             f"{printable(repr(fields['unit']))}. Convert the number to {unit}."
         )
     limit = Constraint(key, fields["side"] == "<=", float(fields["limit"]), unit)
+    if limit.at_most == (fields["name"] in BETTER_LARGER):
+        sign = ">=" if limit.at_most else "<="
+        raise OptionError(
+            f"`{option}` must limit {key} from {'below' if limit.at_most else 'above'}, but it is "
+            f"{limit}. Write {fields['name']}{sign}{fields['limit']}{fields['unit']}."
+        )
     # Every figure that can have an upper limit is above 0, so that no point would comply.
     if limit.at_most and limit.limit <= 0:
         raise OptionError(f"`{option}` must give an upper limit above 0, but it is {limit}.")

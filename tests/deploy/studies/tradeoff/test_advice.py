@@ -12,6 +12,7 @@ from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Figure, measured, predicted, published, unavailable
 from beers_deploy.studies.tradeoff.advice import (
+    BETTER_LARGER,
     NAMES,
     Constraint,
     parse_constraints,
@@ -136,8 +137,9 @@ def having(key: str, figure: Figure) -> Measured:
 @pytest.mark.parametrize("name", NAMES)
 def test_every_figure_can_be_limited_in_its_unit(name: str) -> None:
     key, unit = NAMES[name]
-    first, second = parse_constraints("budget", f"{name.upper()} <= 2.5e1 {unit},psnr>=44")
-    assert first == Constraint(key, True, 25.0, unit)
+    sign = ">=" if name in BETTER_LARGER else "<="
+    first, second = parse_constraints("budget", f"{name.upper()} {sign} 2.5e1 {unit},psnr>=44")
+    assert first == Constraint(key, sign == "<=", 25.0, unit)
     assert str(second) == "PSNR >= 44 dB"
     assert math.isinf(first.violation(having(key, published(1, unit, "a paper"))))
     assert math.isinf(first.violation(having(key, unavailable(unit, "no board"))))
@@ -157,6 +159,15 @@ def test_every_figure_can_be_limited_in_its_unit(name: str) -> None:
 def test_what_is_no_constraint_is_refused(text: str, words: str) -> None:
     with pytest.raises(OptionError, match=f"`budget` .*{re.escape(words)}"):
         parse_constraints("budget", text)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_limit_on_the_wrong_side_is_refused_with_the_right_one(name: str) -> None:
+    signs = ["<=", ">="] if name in BETTER_LARGER else [">=", "<="]
+    wrong, right = (f"{name}{sign}9" for sign in signs)
+    with pytest.raises(OptionError, match=re.escape(f"Write {right}.")):
+        parse_constraints("budget", wrong)
+    assert parse_constraints("budget", right)
 
 
 @given(st.floats(-100, 100), st.floats(0.1, 100), st.booleans())
