@@ -4,6 +4,7 @@ sensor's grid.
 Every r-th point of the blurred scene is sampled, centred, without a shift.
 """
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,13 @@ from scipy import fft
 from beers_deploy.model.raster.images import read_pixels
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.instrument import Instrument
+
+logger = logging.getLogger(__name__)
+
+SATURATED_SHARE = 0.5
+"""The share of a scene above full scale from which its counts are taken for those of another
+scale.
+"""
 
 
 def scene_spectrum(radiance: np.ndarray) -> np.ndarray:
@@ -123,7 +131,11 @@ def read_scene(path: Path, sensor: Instrument) -> Scene:
 
 
 def scene_of(name: str, pixels: np.ndarray, sensor: Instrument) -> Scene:
-    """Convert the pixels of an image to a scene, as `read_scene` does for a file."""
+    """Convert the pixels of an image to a scene, as `read_scene` does for a file.
+
+    Warns if more than half of the scene is brighter than the sensor's full scale, as counts of
+    another scale are: such a scene is saturated.
+    """
     radiance: np.ndarray
     if pixels.dtype == np.uint8:
         radiance = _linear(pixels) * (sensor.max_dn / sensor.gain_dn_per_radiance)
@@ -135,6 +147,17 @@ def scene_of(name: str, pixels: np.ndarray, sensor: Instrument) -> Scene:
         raise ImageError(
             f"{name} must have 8-bit RGB or mono, 16-bit mono, or float mono pixels, but it has "
             f"{pixels.dtype} pixels of shape {pixels.shape}. Convert it to one of these."
+        )
+    full = sensor.max_dn / sensor.gain_dn_per_radiance
+    above = np.count_nonzero(radiance > np.float32(full)) / max(radiance.size, 1)
+    if above > SATURATED_SHARE:
+        logger.warning(
+            "%s: %.0f %% of its pixels are above the sensor's full scale of %d DN or %.4g "
+            "W/m2/sr/um and will saturate; rescale it",
+            name,
+            100 * above,
+            sensor.max_dn,
+            full,
         )
     return Scene(name, np.ascontiguousarray(radiance, dtype=np.float32))
 

@@ -2,6 +2,7 @@
 is shifted.
 """
 
+import logging
 import math
 
 import numpy as np
@@ -10,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beers_deploy.model.simulator.mtf import mtf, smear_response, transfer_function
-from beers_deploy.model.simulator.sampling import resample, sample, scene_spectrum
+from beers_deploy.model.simulator.sampling import resample, sample, scene_of, scene_spectrum
 from beers_deploy.profiles.response import centroid
+from beers_deploy.profiles.sensor import Sensor
 from tests.model.simulator import stages
 
 RATIOS = list(range(1, 9))
@@ -80,6 +82,17 @@ def test_an_offset_moves_the_grid_over_the_scene(ratio: int) -> None:
     shifted = sample(scene_spectrum(radiance), transfer, 21 * ratio, ratio, offset_px=(2.0, -3.0))
     rolled = stages.blurred(np.roll(radiance, (-2, 3), (0, 1)), ratio, 0.07)
     np.testing.assert_allclose(shifted, rolled, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("factor", [1, 16])
+def test_counts_of_another_scale_are_warned_about(
+    factor: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Counts of 12 bits in steps of 16 would all saturate, and teach a network nothing."""
+    counts = np.full((8, 8), 900 * factor, np.uint16)
+    with caplog.at_level(logging.WARNING):
+        scene_of("counts.tif", counts, Sensor.load("pleiades-reference").nominal())
+    assert ("counts.tif: 100 % of its pixels" in caplog.text) == (factor > 1)
 
 
 def test_a_stack_of_scenes_is_sampled_one_by_one() -> None:
