@@ -220,13 +220,13 @@ def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
     Raises:
         ModelError: the file cannot be read, lacks a tensor, or holds no floating-point numbers.
     """
+    reason = unreadable(path)
+    if reason is not None:
+        raise ModelError(f"The weights file {path} cannot be read: {reason}. Check the path.")
     if path.suffix not in SUFFIXES:
         raise ModelError(
             f"{path} must be a .safetensors or .npz file; '{path.suffix}' is not read. {CONVERT}"
         )
-    reason = unreadable(path)
-    if reason is not None:
-        raise ModelError(f"The weights file {path} cannot be read: {reason}. Check the path.")
     try:
         tensors = _read(path, names)
         for tensor in tensors.values():
