@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.files import whole_file
@@ -64,10 +64,9 @@ def write_tensors(path: Path, tensors: Arrays, header: Mapping[str, object]) -> 
     """Write named arrays of any shape and a JSON header as safetensors, whole or not at all."""
     contiguous = {name: np.asarray(array, order="C") for name, array in tensors.items()}
     with whole_file(path) as temporary:
-        save_file(
-            contiguous,
-            temporary,
-            metadata={key: json.dumps(value) for key, value in header.items()},
+        # The library's own writer reports a full disk with an error of its own.
+        temporary.write_bytes(
+            save(contiguous, metadata={key: json.dumps(value) for key, value in header.items()})
         )
         _sort_metadata(temporary)
 

@@ -1,4 +1,6 @@
+import errno
 import json
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -156,6 +158,16 @@ def test_others_can_read_what_is_written(tmp_path: Path) -> None:
     (tmp_path / "plain").touch()
     save_network(tmp_path / "w.safetensors", plain(Variant(1, 4)), {})
     assert (tmp_path / "w.safetensors").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_a_full_disk_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, _: bytes) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(MachineError, match="No space left on device"):
+        write_tensors(tmp_path / "w.safetensors", {"a": np.zeros(3, np.float32)}, {})
+    assert not list(tmp_path.iterdir())
 
 
 def test_conditioned_and_plain_weights_are_not_taken_for_one_another(tmp_path: Path) -> None:
