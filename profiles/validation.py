@@ -17,11 +17,15 @@ Count = Annotated[int, Field(strict=True, ge=0)]
 """An integer of 0 or more, and neither a text nor True, which Python counts as an integer."""
 Amount = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
 """A finite number of 0 or more."""
+Share = Annotated[float, Field(strict=True, ge=0, le=1)]
+"""A number from 0 to 1."""
 
 TABLE_TYPES = ("dataclass_type", "dict_type", "mapping_type", "model_type")
 EXPECTED = {
     **dict.fromkeys(TABLE_TYPES, ("a table", "Write it as [{key}].")),
     "string_type": ("a text", "Write it in quotes."),
+    "string_pattern_mismatch": ("a name of letters, digits, '_', '.' and '-'", "Correct it."),
+    "too_short": ("a list that is not empty", "Add an entry."),
     "tuple_type": ("a list", "Write it in square brackets, with commas between."),
 }
 """TOML's names for pydantic's types of errors, and what to do. For other types pydantic's own

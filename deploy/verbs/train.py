@@ -36,7 +36,7 @@ BESIDE_RECIPE = {"out", "recipe", "images", "device", "resume", "progress"}
 @verb
 def train(
     *,
-    out: Annotated[OutputFolder, Holds(*FILES)],
+    out: Annotated[OutputFolder, Holds(*FILES, folders=("",))],
     recipe: str | None = None,
     images: InputPaths = (),
     pairs: InputPath | None = None,

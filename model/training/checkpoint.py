@@ -177,15 +177,24 @@ def read_checkpoint(
     """
     parts, header = read_tensors(path)
     tensors = {name: torch.from_numpy(array) for name, array in parts.items()}
-    if header.get("recipe") != asdict(recipe):
+    begun = _options(header.get("recipe"))
+    asked = _options(asdict(recipe))
+    changed = []
+    for name, value in asked.items():
+        # The rounding is a digest, which says nothing to a reader.
+        values = f" was {begun.get(name)!r}, and is {value!r}" if name != "rounding" else " differs"
+        if begun.get(name) != value:
+            changed.append(f"`{name}`{values}")
+    if changed:
         raise ModelError(
-            f"The checkpoint {path} belongs to another recipe than {recipe}. Repeat the options "
-            "it was begun with, or choose another folder."
+            f"The checkpoint {path} was begun with other options: {'; '.join(changed)}. Repeat "
+            "those, or choose another folder."
         )
     if header.get("data") != data:
         raise ModelError(
-            f"The checkpoint {path} belongs to a training with other images, sensors or first "
-            "weights. Give the same ones, or choose another folder."
+            f"The checkpoint {path} belongs to a training with other images, held-out sites, "
+            "patches, looks, sensors or first weights. Give the same ones, or choose another "
+            "folder."
         )
     try:
         if header["sha256"] != checkpoint_sha256(tensors, header):
@@ -205,6 +214,15 @@ def read_checkpoint(
             "it was begun with, or start again if the file is damaged."
         ) from error
     return tensors, step, guards
+
+
+def _options(recipe: object) -> dict[str, object]:
+    """Return the options of a training by name, from its recipe as a checkpoint stores it."""
+    options = dict(recipe) if isinstance(recipe, dict) else {}
+    loss = options.pop("loss", None)
+    for term, weight in loss.items() if isinstance(loss, dict) else ():
+        options[f"{term}_weight"] = weight
+    return options
 
 
 def finish(network: Network, path: Path, recipe: dict[str, object]) -> None:

@@ -5,14 +5,24 @@ network that learns from them only restores dark, hazy and soft ground worse tha
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
-from pydantic import with_config
+from pydantic import AfterValidator, Field, with_config
 
 from beers_deploy.model.simulator.chart import log_uniform
-from beers_deploy.profiles.validation import CONFIG, Amount
+from beers_deploy.profiles.validation import CONFIG, Amount, Share
 
-Range = tuple[Amount, Amount]
+
+def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] > ends[1]:
+        raise ValueError(f"must have its lower end first, got {list(ends)}. Exchange the two.")
+    return ends
+
+
+Range = Annotated[tuple[Amount, Amount], AfterValidator(_ordered)]
+Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
+LogRange = Annotated[tuple[Positive, Positive], AfterValidator(_ordered)]
 
 
 @dataclass(frozen=True)
@@ -49,11 +59,11 @@ class Looks:
     """
 
     exposures: Range = (0.5, 1.25)
-    lit_share: Amount = 0.0
-    lights: Range = (0.03, 2.5)
-    calm_share: Amount = 0.0
-    contrasts: Range = (0.05, 1.0)
-    soft_share: Amount = 0.0
+    lit_share: Share = 0.0
+    lights: LogRange = (0.03, 2.5)
+    calm_share: Share = 0.0
+    contrasts: LogRange = (0.05, 1.0)
+    soft_share: Share = 0.0
     softness_px: Range = (0.3, 1.5)
 
     def draw(self, generator: np.random.Generator) -> Look:

@@ -21,6 +21,7 @@ from beers_deploy.model.simulator.mtf import Blur, gamma_from_mtf, transfer_func
 from beers_deploy.model.simulator.sampling import Scene, crop_divisible
 from beers_deploy.model.training.looks import Look
 from beers_deploy.profiles.effects import pixel_effects
+from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import MtfTable, PointSpread
 
@@ -68,7 +69,17 @@ class Pass:
 
 
 def prepare(scene: Scene, multiple: int, device: torch.device | str = "cpu") -> Visited:
-    """Crop a scene so that `multiple` divides its sides, and compute its spectrum."""
+    """Crop a scene so that `multiple` divides its sides, and compute its spectrum.
+
+    Raises:
+        ImageError: the scene is smaller than `multiple`.
+    """
+    height, width = scene.radiance.shape
+    if min(height, width) < multiple:
+        raise ImageError(
+            f"{scene.name} must have at least {multiple} pixels a side to train on, but it has "
+            f"{width} x {height}. Leave it out."
+        )
     radiance = np.ascontiguousarray(crop_divisible(scene.radiance, multiple))
     return Visited(torch.fft.rfft2(torch.from_numpy(radiance).to(device)), radiance.shape[-1])
 

@@ -10,15 +10,19 @@ from typing import Annotated
 
 from pydantic import Field, StrictBool, with_config
 
+from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.training.looks import Looks
 from beers_deploy.model.training.losses import LossWeights
 from beers_deploy.model.training.trainer import Precision
 from beers_deploy.model.variants import variant_named
 from beers_deploy.profiles.errors import ProfileError, printable
 from beers_deploy.profiles.toml import read_toml_text
-from beers_deploy.profiles.validation import CONFIG, Amount, Count, validated
+from beers_deploy.profiles.validation import CONFIG, Amount, Share, validated
 
 RECIPES = Path(__file__).parents[1] / "recipes"
+
+FolderName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+"""A name that leads to no other folder."""
 
 
 @with_config(CONFIG)
@@ -37,13 +41,13 @@ class Stage:
         average: decay per step of the running average of the weights, which is stored.
     """
 
-    name: str
-    steps: Count
-    batch: Count = 8
+    name: FolderName
+    steps: Annotated[int, Field(strict=True, ge=1)]
+    batch: Annotated[int, Field(strict=True, ge=1, le=4096)] = 8
     learning_rate: Amount = 1e-3
     rounding: StrictBool = False
     precision: Precision = "bfloat16"
-    average: Amount = 0.999
+    average: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.999
 
 
 @with_config(CONFIG)
@@ -70,11 +74,11 @@ class NetworkRecipe:
     variant: str
     stages: Annotated[tuple[Stage, ...], Field(min_length=1)]
     start: str = ""
-    seed: Count = 0
-    patch_px: Count = 96
-    charts: Count = 0
+    seed: Annotated[int, Field(strict=True, ge=0, le=SEEDS)] = 0
+    patch_px: Annotated[int, Field(strict=True, ge=17, le=2048)] = 96
+    charts: Annotated[int, Field(strict=True, ge=0, le=1000)] = 0
     held_out: tuple[str, ...] = ()
-    other_curves: Amount = 0.0
+    other_curves: Share = 0.0
     looks: Looks = field(default_factory=Looks)
     loss: LossWeights = field(default_factory=LossWeights)
     attribution: tuple[str, ...] = ()

@@ -110,6 +110,11 @@ def train(run: Run, resume: bool, worker: Worker) -> None:
     if loss.perceptual is not None:
         loss.perceptual.to(trainer.device)
     trainer.data = data_sha256(run, loss)
+    if resume and not run.checkpoint.exists():
+        raise OptionError(
+            f"`resume` has no run to continue: no such file {run.checkpoint}. Leave `resume` out "
+            "to begin one, or give its folder."
+        )
     if resume:
         trainer.resume(run.checkpoint)
     elif run.checkpoint.exists():
@@ -242,6 +247,15 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
     worker = trainer.worker
     ranks = worker.rank, worker.count
     patches = PatchSource(train_on, run.patches, recipe.batch, recipe.seed, *ranks, trainer.device)
+    if patches.unused and worker.first:
+        logger.warning(
+            "%d of the %d training images are too small for a patch of %d px and teach nothing, "
+            "such as %s",
+            len(patches.unused),
+            len(train_on),
+            run.patches.patch_px,
+            patches.unused[0],
+        )
     return patches.batches, validation, [scene.name for scene in train_on]
 
 

@@ -87,6 +87,11 @@ class PatchSource:
         self.workers = workers
         common = int(np.lcm.reduce(recipe.oversamplings))
         self._scenes = [prepare(scene, common, device) for scene in scenes]
+        self.unused = [
+            scene.name
+            for scene, visited in zip(scenes, self._scenes, strict=True)
+            if _room_px(visited, recipe, min(recipe.oversamplings)) < recipe.patch_px
+        ]
 
     def batches(self, first: int = 0) -> Iterator[Batch]:
         """Yield batch number `first` and all that follow, so that a resumed run continues where it
@@ -153,8 +158,7 @@ def _mixed(visits: Sequence[Visit], order: np.ndarray) -> Batch:
 def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -> Visit | None:
     """Simulate one pass over a scene and return all its patches, or None if none fits."""
     ratio = int(generator.choice(recipe.oversamplings))
-    room = min(scene.sides) // ratio - 2 * recipe.margin_px
-    if room < recipe.patch_px:
+    if _room_px(scene, recipe, ratio) < recipe.patch_px:
         return None
     images, sensor = _acquire_pair(scene, recipe, ratio, generator)
     patches = cut(images, recipe.patch_px, generator)
@@ -164,6 +168,11 @@ def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -
     if recipe.family is None:
         return Visit(turned(patches, quarter, mirrored), None)
     return _conditioned(turned(patches, quarter, mirrored), sensor, quarter, mirrored)
+
+
+def _room_px(scene: Visited, recipe: PatchRecipe, ratio: int) -> int:
+    """Return the side within the margins of an image of a scene, in pixels."""
+    return min(scene.sides) // ratio - 2 * recipe.margin_px
 
 
 def _acquire_pair(

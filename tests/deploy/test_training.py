@@ -79,7 +79,46 @@ def test_a_run_is_not_resumed_with_other_data(images: Path, finished: Path, tmp_
     command = f"train --out {finished} --variant convbeers-xs --steps 4 --batch 2 --patch 32"
     for data in (other, f"{images} --sensor dior-high", f"{images} --drawn 1"):
         message = refused(f"{command} --validate-every 2 --resume --images {data}")
-        assert "a training with other images, sensors or first weights" in message
+        assert "a training with other images, held-out sites, patches" in message
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ("--steps 5", "--steps was 4, and is 5"),
+        ("--learning-rate 0.1", "--learning-rate was 0.001, and is 0.1"),
+        ("--l1-weight 2", "--l1-weight was 1.0, and is 2.0"),
+    ],
+)
+def test_a_run_is_not_resumed_with_other_options(
+    option: str, words: str, images: Path, finished: Path
+) -> None:
+    usual = "--variant convbeers-xs --steps 4 --batch 2 --patch 32 --validate-every 2"
+    message = refused(f"train --images {images} --out {finished} {usual} --resume {option}")
+    assert words in message
+
+
+def test_nothing_is_resumed_in_an_empty_folder(images: Path, tmp_path: Path) -> None:
+    message = refused(f"train --images {images} --out {tmp_path}/none --resume")
+    assert "--resume has no run to continue" in message
+
+
+def test_pictures_are_not_written_among_the_images(images: Path) -> None:
+    """The picture of the validation would be an image of the next run."""
+    before = sorted(images.iterdir())
+    assert "folder of an input" in refused(f"train --images {images} --out {images} --steps 1")
+    assert sorted(images.iterdir()) == before
+
+
+def test_images_that_are_too_small_are_named(images: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(images, tmp_path / "images"))
+    Image.new("L", (80, 80)).save(folder / "yard_1.png")
+    assert "1 of the " in (said := run(folder, tmp_path / "r", steps=1)), said
+    Image.new("L", (40, 80)).save(folder / "yard_1.png")
+    message = refused(
+        f"train --images {folder} --out {tmp_path}/s --steps 1 --variant convbeers-xs"
+    )
+    assert "yard_1.png must have at least 60 pixels a side" in message
 
 
 def test_a_checkpoint_with_a_flipped_bit_is_refused(
@@ -132,7 +171,8 @@ def test_a_run_with_the_roundings_of_int8_differs_from_one_without_and_resumes_t
         for k, value in weights_of(tmp_path / "a" / f"{name}.safetensors").items()
     )
     message = refused(f"train --images {images} --out {tmp_path}/a --steps 4 --resume {options}")
-    assert "another recipe" in message
+    assert "begun with other options: " in message
+    assert "--rounding differs" in message
 
 
 @pytest.mark.parametrize(
