@@ -99,6 +99,11 @@ class TargetProfile:
         """
         if isinstance(board, cls):
             return board
+        if not isinstance(board, TargetProfile | str | os.PathLike):
+            raise ProfileError(
+                "A board must be a Board, a name or the path of a .toml file, got "
+                f"{type(board).__name__}. 'beers-deploy profiles' lists the names."
+            )
         if not isinstance(board, TargetProfile):
             board = _read(os.fspath(board).removesuffix(MODEL_SUFFIX))
         return cls(**vars(board))

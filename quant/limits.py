@@ -103,18 +103,15 @@ def limits_of(
     values: Mapping[str, object]
     if isinstance(source, str | os.PathLike):
         where = str(source)
-        try:
-            values = read_toml_text(Path(source))
-        except (OSError, ValueError) as error:
-            reason = unreadable(Path(source)) or printable(str(error))
-            raise OptionError(
-                f"The limits cannot be read from {where}: {reason}. Give a TOML file with lines "
-                "such as mae = 0.0007."
-            ) from error
+        values = _read(Path(source))
     elif isinstance(source, Mapping):
         values = source
-    else:
+    elif source is None or isinstance(source, Limits):
         values = vars(source or Limits())
+    else:
+        raise OptionError(
+            f"{where} must be Limits, a mapping or a TOML file, got {printable(repr(source))}."
+        )
     if not values:
         raise OptionError(
             f"{where} must set at least one of {', '.join(BREAKABLE)}, for example mae = 0.0007."
@@ -127,6 +124,18 @@ def limits_of(
         _require_breakable("`max_mae`", "mae", max_mae)
         numbers["mae"] = max_mae
     return Limits(**numbers)
+
+
+def _read(path: Path) -> dict[str, object]:
+    """Read the limits in a TOML file, or raise OptionError."""
+    try:
+        return read_toml_text(path)
+    except (OSError, ValueError) as error:
+        reason = unreadable(path) or printable(str(error))
+        raise OptionError(
+            f"The limits cannot be read from {path}: {reason}. Give a TOML file with lines such as "
+            "mae = 0.0007."
+        ) from error
 
 
 def _require_breakable(where: str, name: str, value: object) -> None:

@@ -33,13 +33,12 @@ def boards_of(board: BoardLike | Sequence[BoardLike]) -> list[TargetProfile]:
         ProfileError: there is no such board, or its file is not valid.
     """
     sources: Sequence[BoardLike]
-    if isinstance(board, os.PathLike | TargetProfile):
-        sources = [board]
-    elif isinstance(board, str):
+    if isinstance(board, str):
         every = board.removesuffix(MODEL_SUFFIX) == ALL
         sources = board_names() if every else [name.strip() for name in board.split(",")]
     else:
-        sources = board
+        # What is no board is refused when it is loaded.
+        sources = board if isinstance(board, list | tuple) else [board]
     return list(map(TargetProfile.load, sources))
 
 

@@ -3,7 +3,7 @@ predicted of it.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from operator import mul
 
@@ -308,7 +308,8 @@ def parse_size(size: str | tuple[int, int]) -> tuple[int, int]:
     Raises:
         OptionError: the text has another form, or a side is not from 1 to SIDE_PX.
     """
-    text = size if isinstance(size, str) else "x".join(map(str, size))
+    several = isinstance(size, Iterable) and not isinstance(size, str)
+    text = "x".join(map(str, size)) if several else str(size)
     parts = text.lower().split("x")
     # Python raises an error of its own for very long numbers, so these are refused by their length.
     if len(parts) != 2 or not all(

@@ -6,7 +6,7 @@ predicted, and the paper's figures.
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -324,9 +324,11 @@ def parse_tiles(tile: int | str | Sequence[int]) -> list[int]:
     Raises:
         OptionError: a side is not an integer from 16 to MOST_TILE_PX.
     """
-    parts: Sequence[int | str] = [tile] if isinstance(tile, int) else tile
+    parts: Iterable[object] = [tile]
     if isinstance(tile, str):
         parts = tile.split(",")
+    elif isinstance(tile, Iterable):
+        parts = tile
     sides = [str(part).strip() for part in parts]
     # Python raises an error of its own for very long numbers, so these are refused by their length.
     if not sides or not all(

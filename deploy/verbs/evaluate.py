@@ -2,13 +2,14 @@
 
 import logging
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.verbs.parameters import (
     Factors,
     Holds,
@@ -183,6 +184,11 @@ def named_methods(methods: Methods) -> dict[str, Any]:
     if isinstance(methods, Mapping):
         return {"degraded": "degraded", **methods}
     names = methods.split(",") if isinstance(methods, str) else methods
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+        raise OptionError(
+            f"`methods` must be names, or a mapping of names to networks or functions, got "
+            f"{printable(repr(methods))}."
+        )
     # A method that is named twice is measured once, in the order that is given.
     return {name.strip(): name.strip() for name in ("degraded", *names)}
 
@@ -197,8 +203,8 @@ def numbers_of(name: str, value: Factors, example: str) -> tuple[float, ...]:
     """
     parts = value.split(",") if isinstance(value, str) else value
     try:
-        return tuple(float(part) for part in parts)
-    except ValueError as error:
+        return tuple(float(part) for part in ([parts] if isinstance(parts, Real) else parts))
+    except (TypeError, ValueError) as error:
         raise OptionError(
             f"`{name}` must be numbers separated by commas, such as {example}, got {value!r}."
         ) from error
@@ -206,11 +212,16 @@ def numbers_of(name: str, value: Factors, example: str) -> tuple[float, ...]:
 
 def _stored_or_given(pairs: "Pairs | None") -> "tuple[Path | None, Sequence[Pair] | None]":
     """Return the folder of stored pairs, and pairs in memory: one of them is None, or both."""
+    from beers_deploy.pairs import Pair
+
     if pairs is None:
         return None, None
     if isinstance(pairs, str | os.PathLike):
         return Path(pairs), None
-    return None, list(pairs)
+    several = list(pairs) if isinstance(pairs, Iterable) else [pairs]
+    if not all(isinstance(pair, Pair) for pair in several):
+        raise OptionError("`pairs` must be a folder, or a list of Pair as `simulate` returns them.")
+    return None, several
 
 
 def _sensors(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import wraps
 from inspect import Parameter, signature
 from itertools import product
-from numbers import Real
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar, cast, get_args, get_origin
 
@@ -91,14 +91,17 @@ def require_allowed(parameter: Parameter, value: object) -> None:
     if bool in parts and isinstance(value, str):
         raise OptionError(f"`{name}` must be True or False, got {printable(repr(value))}.")
     number = _number(name, value) if {int, float}.intersection(parts) else None
-    if number is not None and float not in parts and not number.is_integer():
+    if number is not None and float not in parts and not isinstance(value, Integral):
         raise OptionError(f"`{name}` must be an integer, got {printable(repr(value))}.")
     for part in parts:
         if isinstance(part, Interval) and number is not None:
             _require_inside(name, number, part)
-        if get_origin(part) is Literal and value not in get_args(part):
-            names = ", ".join(map(repr, get_args(part)))
-            raise OptionError(f"`{name}` must be one of {names}, got {value!r}.")
+        # An array compares element by element.
+        choices = get_args(part) if get_origin(part) is Literal else None
+        if choices and not (isinstance(value, str | Real) and value in choices):
+            names = ", ".join(map(repr, choices))
+            given = printable(repr(value))
+            raise OptionError(f"`{name}` must be one of {names}, got {given}.")
 
 
 def _require_text(name: str, value: object, parts: list[Any]) -> None:
@@ -265,7 +268,14 @@ def changed(
         names: of the parameters that are asked about.
     """
     parameters = signature(function).parameters
-    return {name: bool(values[name] != parameters[name].default) for name in names}
+    different = {}
+    for name in names:
+        value = values[name]
+        default = parameters[name].default
+        # An array compares element by element, and is no default.
+        is_plain = isinstance(value, str | Real | Path | Sequence | Mapping)
+        different[name] = value is not default and not (is_plain and bool(value == default))
+    return different
 
 
 def refuse_with(other: str, **options: bool) -> None:

@@ -302,6 +302,31 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
     ),
     "no samples": (lambda raw: bd.quantize(Tiny(), samples={"image": raw}), "or a path"),
     "no swath": (lambda _: bd.bench(SMALL, size=(0, 0)), r"`size` .*\(0, 0\)"),
+    "one side": (lambda _: bd.bench(SMALL, size=5), "`size` must be WIDTHxHEIGHT"),  # type: ignore[arg-type]
+    "half a pixel": (
+        lambda _: bd.bench(SMALL, size="64x64", tile=32.5),  # type: ignore[arg-type]
+        "`tile` must be sides",
+    ),
+    "no name of a board": (lambda _: bd.bench(SMALL, target=5), "A board must be"),  # type: ignore[arg-type]
+    "no limits": (lambda _: bd.gate(SMALL, limits=5), "`limits` must be Limits"),  # type: ignore[arg-type]
+    "no name of a method": (lambda _: bd.evaluate(methods=5), "`methods` must be names"),  # type: ignore[arg-type]
+    "no list of pairs": (
+        lambda raw: bd.evaluate(methods="degraded", pairs=[raw]),  # type: ignore[list-item]
+        "`pairs` must be a folder",
+    ),
+    "no factor": (
+        lambda _: bd.evaluate(methods="degraded", brightness=[None]),  # type: ignore[list-item]
+        "`brightness` must be numbers",
+    ),
+    "an array with pairs": (
+        lambda raw: bd.evaluate(methods="degraded", pairs="pairs", brightness=raw),  # type: ignore[arg-type]
+        "`brightness` has no effect with `pairs`",
+    ),
+    "an array of choices": (
+        lambda raw: bd.simulate(preset=raw),  # type: ignore[arg-type]
+        "`preset` must be one of",
+    ),
+    "a float as a size": (lambda _: bd.simulate(size=64.0), "`size` must be an integer"),  # type: ignore[arg-type]
     "no size": (lambda _: bd.simulate(size=0), "`size` must be from 1 to 4096"),
     "other sizes": (lambda raw: simulated(size=48).psnr(raw), r"`image` has the shape \(61, 83\)"),
     "no figure": (lambda _: bd.sensors().plot("x"), "`figure` must be one of MTF.*'x'"),
