@@ -6,8 +6,9 @@
 2. A convolution of one pixel sums the parts, channel by channel. Behind a sum by Adds a DPU has no
    activation but ReLU, and as the network's last operation it would have 8 bits.
 
-All of it is exact except for the rounding of float32. A kernel is not split if parts would begin
-inside the map, as those of a kernel without padding do, or if one of its rows is too large.
+Where a part would begin or end inside the map, as with a kernel without padding, a depthwise
+convolution that reads one pixel crops the map first. All of it is exact except for the rounding of
+float32. A kernel is not split if one of its rows is too large.
 """
 
 import numpy as np
@@ -30,50 +31,50 @@ def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
         node: any node.
 
     Returns:
-        A convolution for each part, their Concat, and the convolution that sums them; None if the
-        node is no convolution that is split.
+        A convolution for each part, some behind a crop, their Concat, and the convolution that sums
+        them; None if the node is no convolution that is split.
     """
     if node.op_type != "Conv" or not is_convolution(graph, node):
         return None
     weight = graph.constants[node.inputs[1]]
-    outputs, _, rows, columns = weight.shape
+    outputs, channels, rows, columns = weight.shape
     states_pads = node.attributes.get("auto_pad", "NOTSET") == "NOTSET"
-    one_group = node.attributes.get("group", 1) == 1
+    channels *= node.attributes.get("group", 1)
     is_large = rows * columns > LARGE_POSITIONS
-    if not (is_large and states_pads and one_group and columns <= MOST_POSITIONS):
+    if not (is_large and states_pads and columns <= MOST_POSITIONS):
         return None
     # A part may have MOST_POSITIONS // columns rows, so this is the least number of parts.
     step = -(-rows // (MOST_POSITIONS // columns))
     pads = node.attributes.get("pads", [0, 0, 0, 0])
     dilations = node.attributes.get("dilations", [1, 1])
     name = node.proto.name or node.outputs[0]
-    parts: list[Node] = []
+    nodes: list[Node] = []
+    parts: list[str] = []
     # 1.
     for first in range(step):
         kernel = weight[:, :, first::step]
         # The part's last row lies this many rows above the last one of the whole kernel.
         behind = (rows - 1 - first) % step
-        part_pads = [
-            pads[0] - first * dilations[0],
-            pads[1],
-            pads[2] - behind * dilations[0],
-            pads[3],
-        ]
-        if min(part_pads) < 0:
-            return None
+        above = pads[0] - first * dilations[0]
+        below = pads[2] - behind * dilations[0]
+        part = f"{name}.rows_{first}"
+        source = node.inputs[0]
+        if min(above, below) < 0:
+            tap = np.eye(max(-above, 0) + max(-below, 0) + 1)[max(-above, 0)]
+            crop = np.tile(tap[:, None], (channels, 1, 1, 1))
+            source = f"{part}.cropped"
+            nodes.append(graph.convolution(node.inputs[0], source, source, crop, group=channels))
         attributes = {
             **node.attributes,
             "kernel_shape": list(kernel.shape[2:]),
-            "pads": part_pads,
+            "pads": [max(above, 0), pads[1], max(below, 0), pads[3]],
             "dilations": [step * dilations[0], dilations[1]],
         }
-        part = f"{name}.rows_{first}"
-        parts.append(graph.convolution(node.inputs[0], part, part, kernel, **attributes))
+        nodes.append(graph.convolution(source, part, part, kernel, **attributes))
+        parts.append(part)
     # 2.
     # The bias is added once, by the convolution that sums, so the parts have none.
-    joined = Node.new(
-        "Concat", [part.outputs[0] for part in parts], f"{name}.rows", f"{name}.rows", axis=1
-    )
+    joined = Node.new("Concat", parts, f"{name}.rows", f"{name}.rows", axis=1)
     ones = graph.add_constant(f"{name}.sum", np.tile(np.eye(outputs), step)[..., None, None])
     feeds = [joined.outputs[0], ones, *node.inputs[2:]]
-    return [*parts, joined, Node.new("Conv", feeds, node.outputs[0], name, kernel_shape=[1, 1])]
+    return [*nodes, joined, Node.new("Conv", feeds, node.outputs[0], name, kernel_shape=[1, 1])]
