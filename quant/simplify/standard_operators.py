@@ -85,6 +85,66 @@ def split_sums(_: OnnxGraph, node: Node) -> list[Node] | None:
     return adds
 
 
+def choose_by_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace the larger or the smaller of two maps, and the size of a map, by sums with ReLU:
+    max(a, b) = a + ReLU(b - a), min(a, b) = a - ReLU(a - b), and abs(a) = ReLU(a) + ReLU(-a).
+
+    Args:
+        graph: the graph that the node belongs to.
+        node: any node.
+
+    Returns:
+        The nodes that replace the node; None if it is something else.
+    """
+    if node.op_type not in ("Abs", "Max", "Min"):
+        return None
+    (result,) = node.outputs
+    rest = f"{result}.difference"
+    limited = f"{result}.relu"
+    relu = Node.new("Relu", [rest], limited, limited)
+    a, *others = node.inputs
+    if node.op_type == "Abs":
+        positive = f"{result}.positive"
+        return [
+            Node.new("Neg", [a], rest, rest),
+            relu,
+            Node.new("Relu", [a], positive, positive),
+            Node.new("Add", [positive, limited], result, node.name),
+        ]
+    if len(others) != 1 or not graph.constants.keys().isdisjoint(node.inputs):
+        return None
+    is_max = node.op_type == "Max"
+    return [
+        Node.new("Sub", [*others, a] if is_max else [a, *others], rest, rest),
+        relu,
+        Node.new("Add" if is_max else "Sub", [a, limited], result, node.name),
+    ]
+
+
+def drop_where(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Remove a Where by a constant that chooses one of two maps everywhere, as torch writes a lerp.
+
+    Args:
+        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
+        graph: the graph that the node belongs to.
+        node: any node.
+
+    Returns:
+        An empty list if the node is removed; None if it stays.
+    """
+    chooses = graph.value(node, 0) if node.op_type == "Where" else None
+    if chooses is None or chooses.size != 1:
+        return None
+    source = node.inputs[1] if chooses.item() else node.inputs[2]
+    result = node.outputs[0]
+    # A smaller map would have been repeated.
+    is_of_size = source in shapes and shapes[source] == shapes.get(result)
+    if graph.sole_writer(source) is None or not is_of_size:
+        return None
+    graph.rename(source, result)
+    return []
+
+
 def drop_cast(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Remove a Cast to float32 of a tensor that is float32 already.
 

@@ -143,6 +143,15 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         f"c = {SAME}(x, one) m = Mul(c, image) y = {SAME}(m, w)",
         {"Conv": 3},
     ),
+    "the larger, the smaller and the size": (
+        f"{CONV} m = Max(x, c) n = Min(m, c) y = Abs(n)",
+        {"Conv": 2, "Add": 5, "Mul": 3, "Relu": 4},
+    ),
+    "a lerp": (
+        f"""{CONV} near = Less(half, sixth) d = Sub(c, x) e = Mul(d, half) f = Add(x, e)
+        g = Mul(d, sixth) h = Sub(c, g) y = Where(near, f, h)""",
+        {"Conv": 1, "Add": 2, "Mul": 3},
+    ),
     "the negative of a map": (
         f"{CONV} n = Neg(x) m = Neg(c) a = Add(n, m) y = Mul(a, x)",
         {"Conv": 2, "Add": 1, "Mul": 1},
