@@ -16,7 +16,7 @@ import numpy as np
 
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings.host import live_tensors, part_model
-from beers_deploy.quant.graph import CORRECTION, PLANES, Graph, graph_to_onnx
+from beers_deploy.quant.graph import CORRECTION, PLANES, Graph, graph_to_onnx, tensors
 from beers_deploy.quant.host_part import ZERO, HostPart
 from beers_deploy.quant.input_range import Ranges
 from beers_deploy.quant.passes.effort import span
@@ -227,6 +227,10 @@ class CropTrials:
 
         return trial
 
+    def error(self, graph: Graph) -> float:
+        """Return the sum of a graph's errors in INT8 on all crops."""
+        return float(self(graph, tensors(graph))(graph)(None).sum())
+
     def _costs(self, parts: "list[_Part]", values: list[Values], core: IntCore) -> Costs:
         """Return a function for the root mean squared difference of an integer network from the
         float one, by crop.
@@ -240,10 +244,10 @@ class CropTrials:
         # 4.
         def cost(number: int) -> float:
             target = self.targets[number]
-            tensors = values[number]
+            outputs = values[number]
             for part in parts:
-                tensors = part(tensors)
-            result = (tensors[CORRECTION] - np.float32(ZERO)) * np.float32(core.scale(CORRECTION))
+                outputs = part(outputs)
+            result = (outputs[CORRECTION] - np.float32(ZERO)) * np.float32(core.scale(CORRECTION))
             restored = core.host_part.restore(target.image, result, core.scale(CORRECTION))
             return target.weight * _rms(restored - target.result) / self.changes[number]
 

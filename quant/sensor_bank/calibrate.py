@@ -45,7 +45,7 @@ from beers_deploy.quant.passes.effort import Effort
 from beers_deploy.quant.passes.equalize_single import SingleTensors
 from beers_deploy.quant.passes.residual_groups import residual_groups, single_tensors
 from beers_deploy.quant.passes.selection import ALL, Passes
-from beers_deploy.quant.quantize import Plan, rounded
+from beers_deploy.quant.plan import Plan, rounded
 from beers_deploy.quant.samples.patches import PATCH_PX, Regenerated
 from beers_deploy.quant.samples.simulated import draw_patches
 from beers_deploy.quant.sensor_bank.conditioned import BANK, ConditionedCore, bank_layer

@@ -137,7 +137,7 @@ def test_what_calibration_sees_is_not_clipped_where_the_image_itself_passes(
     loud: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "beers_deploy.quant.quantize.equalize_single",
+        "beers_deploy.quant.plan.equalize_single",
         lambda _g, _c, ranges, *_: loud * FULL / ranges,
     )
     model, _, _, singles = read("espcn")
@@ -171,7 +171,7 @@ def test_unequal_channels_err_half_as_much_once_they_are_equalized(
 
     equalized = mae()
     monkeypatch.setattr(
-        "beers_deploy.quant.quantize.equalize_single",
+        "beers_deploy.quant.plan.equalize_single",
         lambda _graph, _chain, _ranges, start, *_: start,
     )
     assert equalized < 0.5 * mae()

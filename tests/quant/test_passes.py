@@ -1,5 +1,6 @@
 """The passes: each leaves the float network as it was, and does to the integer one what it says."""
 
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from itertools import product
 from unittest.mock import patch
@@ -43,12 +44,13 @@ from beers_deploy.quant.passes.residual_groups import (
     residual_groups,
 )
 from beers_deploy.quant.passes.selection import Passes
-from beers_deploy.quant.passes.trial import Costs
+from beers_deploy.quant.passes.trial import Costs, CropTrials
 from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session, result_of
 from tests.quant.quick import image, in_float, quickly
 from tests.quant.simplify.networks import parsed
+from tests.quant.test_odd_networks import SAME, sketch
 
 
 def group_of(graph: Graph) -> ResidualGroup:
@@ -287,6 +289,34 @@ def test_each_step_is_named(float_onnx: onnx.ModelProto, patches: Patches) -> No
     assert [name.split(" ")[0] for name in names] == ["scale", "float", "equalising"]
 
 
+def one_scale() -> AbstractContextManager[object]:
+    """One scale for each residual group, even if scales of their own err less."""
+    return patch.object(CropTrials, "error", return_value=0.0)
+
+
+def test_sums_that_grow_by_far_have_scales_of_their_own(patches: Patches) -> None:
+    model = sketch(
+        f"""first = {SAME}(in, first_w, first_b) inner = {SAME}(first, inner_w, inner_b)
+        one = Relu(inner) sum = Add(one, first) next = {SAME}(sum, next_w, next_b)
+        two = Relu(next) end = Add(two, sum) out = {SAME}(end, last_w, last_b)""",
+        sizes={"first": 0.01, "inner": 10, "next": 10},
+        first=(8, 1, 3, 3),
+        inner=(8, 8, 3, 3),
+        next=(8, 8, 3, 3),
+        last=(1, 8, 3, 3),
+    )
+    with one_scale():
+        shared = quickly(model, patches)
+    apart = quickly(model, patches)
+    shown = image(40, 40)
+    expected = result_of(open_session(model), shown)
+    errors = [
+        np.abs(result_of(open_session(each.host), shown) - expected).mean()
+        for each in (apart, shared)
+    ]
+    assert errors[0] < errors[1] / 2
+
+
 def test_a_small_tensor_of_a_group_has_a_finer_scale(patches: Patches) -> None:
     """What is magnified right behind it, as by a normalisation, would magnify its steps."""
     generator = np.random.default_rng(0)
@@ -302,7 +332,7 @@ def test_a_small_tensor_of_a_group_has_a_finer_scale(patches: Patches) -> None:
         constants=weights,
     )
     finer = quickly(model, patches)
-    with patch("beers_deploy.quant.quantize.finer_members", return_value={}):
+    with one_scale(), patch("beers_deploy.quant.plan.finer_members", return_value={}):
         plain = quickly(model, patches)
     assert finer.core.frac_bits["head"] > plain.core.frac_bits["head"]
     shown = image(40, 40)
