@@ -70,7 +70,7 @@ from beers_deploy.quant.simplify.spelled_activations import (
     join_clips,
     join_hard_swish,
 )
-from beers_deploy.quant.simplify.split_channels import split_channels
+from beers_deploy.quant.simplify.split_channels import read_unselected, split_channels
 from beers_deploy.quant.simplify.standard_operators import (
     choose_by_relu,
     drop_cast,
@@ -186,6 +186,7 @@ def _run_passes(model: onnx.ModelProto) -> None:
     # A normalisation that has become a convolution takes in what stands around it.
     graph.rewrite(fold_behind)
     fold_in_front(graph, shapes)
+    graph.rewrite(partial(read_unselected, shapes))
     graph.rewrite(ConnectByConvolutions(shapes))
     graph.save()
 

@@ -5,6 +5,9 @@
    the weights of its channels. Activations and depthwise convolutions in between are divided with
    it. The amount of computation does not change.
 3. In front of any other operation, a convolution of one pixel selects the channels.
+4. Behind a concat that has such a selection of most channels, as partial convolutions have, a
+   convolution reads the whole map, with zeros for the channels that are not selected. The selection
+   would round the map once more, to a scale that equalisation does not reach.
 
 All of it is exact. The divided nodes remain, and are removed if nothing reads them.
 """
@@ -117,3 +120,57 @@ def _groups(graph: OnnxGraph, node: Node | None) -> int:
     groups = int(node.attributes.get("group", 1))
     # The channels of a group read others of their group, which the part need not have.
     return groups if groups == 1 or (groups == outputs and inputs == 1) else 0
+
+
+def read_unselected(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Let a convolution behind a concat read whole maps in place of selections of most of their
+    channels (point 4 of the module).
+
+    Args:
+        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
+        graph: the graph that the node belongs to; its constants are extended.
+        node: any node.
+
+    Returns:
+        The concat and the convolution; None if the node is something else.
+    """
+    joined = graph.sole_writer(node.inputs[0]) if _groups(graph, node) == 1 else None
+    if joined is None or joined.op_type != "Concat":
+        return None
+    weight = graph.constants[node.inputs[1]]
+    parts: list[str] = []
+    columns: list[np.ndarray] = []
+    first = 0
+    for name in joined.inputs:
+        width = channels_in(shapes, name)
+        part = weight[:, first : first + width]
+        first += width
+        before = graph.sole_writer(name)
+        chosen = _selected(graph, before) if before is not None else None
+        if before is None or chosen is None or 2 * width < chosen.shape[1]:
+            parts.append(name)
+            columns.append(part)
+        else:
+            parts.append(before.inputs[0])
+            columns.append(np.einsum("oirc,ij->ojrc", part, chosen))
+    if parts == list(joined.inputs) or first != weight.shape[1]:
+        return None
+    name = f"{node.name}.whole"
+    concat = Node.new("Concat", parts, name, name, axis=1)
+    wide = graph.add_constant(f"{name}.weight", np.concatenate(columns, 1))
+    behind = Node.of(node.written())
+    behind.inputs = (name, wide, *node.inputs[2:])
+    return [concat, behind]
+
+
+def _selected(graph: OnnxGraph, node: Node) -> np.ndarray | None:
+    """Return the weights (O, I) of a convolution of one pixel that selects channels; None for
+    another node.
+    """
+    if _groups(graph, node) != 1 or graph.value(node, 2) is not None:
+        return None
+    weight = graph.constants[node.inputs[1]]
+    is_one_pixel = weight.shape[2:] == (1, 1) and not any(node.attributes.get("pads", []))
+    is_one_pixel = is_one_pixel and set(node.attributes.get("strides", [1])) == {1}
+    is_selection = ((weight == 0) | (weight == 1)).all() and (weight.sum((1, 2, 3)) == 1).all()
+    return weight[:, :, 0, 0] if is_one_pixel and is_selection else None

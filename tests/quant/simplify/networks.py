@@ -24,6 +24,7 @@ WEIGHTS: dict[str, tuple[int, ...]] = {
     "image": (4, 1, 1),
     "square": (4, 4),
     "wide": (24, 5),
+    "one_one": (1, 1, 3, 3),
 }
 NUMBERS = {
     "zero": 0.0,
@@ -151,6 +152,11 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         f"""{CONV} near = Less(half, sixth) d = Sub(c, x) e = Mul(d, half) f = Add(x, e)
         g = Mul(d, sixth) h = Sub(c, g) y = Where(near, f, h)""",
         {"Conv": 1, "Add": 2, "Mul": 3},
+    ),
+    "a partial convolution": (
+        f"""k, l = Split<axis=1>(x, one_three) m = {SAME}(k, one_one) d = Concat<axis=1>(m, l)
+        e = {SAME}(d, w) y = Add(e, x)""",
+        {"Conv": 3, "Concat": 1, "Add": 1},
     ),
     "the negative of a map": (
         f"{CONV} n = Neg(x) m = Neg(c) a = Add(n, m) y = Mul(a, x)",
