@@ -162,7 +162,7 @@ def _read_resize(node: Node, graph: OnnxGraph) -> Op:
         require(
             blocks,
             node,
-            "must be a nearest resize that makes a block of each pixel, got "
+            "must make a block of each pixel, or be bilinear by 2 or 4, got "
             f"{resizing.mode}, {where}, {resizing.rounding} by {factor}",
         )
     return Resize(node.name, node.inputs[0], node.outputs[0], factor, resizing.mode == "linear")

@@ -4,7 +4,7 @@
 these properties:
 
 1. Constants are initializers, each float32 even if it was float16 or float64, and no initializer is
-   an input.
+   an input. An image of integers that is cast first is float32, too.
 2. There is no Identity, Constant, Dropout, needless Cast, and no arithmetic on constants.
 3. There is no BatchNormalization, and no Mul, Add, Sub or Div by one constant per channel, behind a
    convolution that only it reads, nor in front of convolutions where folding is exact. A remaining
@@ -106,6 +106,7 @@ ALTERING = [
 slices into a Gather, and prevent pixel shuffles from being recognised.
 """
 
+INTEGERS = (TensorProto.UINT8, TensorProto.UINT16)
 OTHER_FLOATS = (TensorProto.FLOAT16, TensorProto.BFLOAT16, TensorProto.DOUBLE)
 
 
@@ -129,6 +130,7 @@ def simplify(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 
 def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     network = deepcopy(model)
+    _to_float_image(network.graph)
     _to_float32(network)
     channels_first(network)
     weights = {tensor.name for tensor in network.graph.initializer}
@@ -211,6 +213,19 @@ def _is_plain(model: onnx.ModelProto) -> bool:
         without_groups(graph, node) or split_large_kernel(graph, node) for node in graph.nodes
     )
     return not has_other_convolutions and not broadcasts_channels(model)
+
+
+def _to_float_image(graph: onnx.GraphProto) -> None:
+    """Let an image of integers that is cast before anything is computed be float32."""
+    images = {v.name for v in graph.input if v.type.tensor_type.elem_type in INTEGERS}
+    for node in graph.node:
+        if node.op_type == "Transpose" and images.intersection(node.input):
+            images.update(node.output)
+    readers = {node.op_type for node in graph.node if images.intersection(node.input)}
+    if readers <= {"Cast", "Transpose"}:
+        for value in (*graph.input, *graph.value_info):
+            if value.name in images:
+                value.type.tensor_type.elem_type = TensorProto.FLOAT
 
 
 def _to_float32(model: onnx.ModelProto) -> None:

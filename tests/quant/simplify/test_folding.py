@@ -194,3 +194,18 @@ def test_sizes_that_contradict_the_nodes_are_one_sentence_or_read() -> None:
         assert "Conv" in kinds(simplify(model, "a.onnx"))
     except ModelError as error:
         assert "a.onnx" in str(error)  # noqa: PT017 - either will do
+
+
+@pytest.mark.parametrize("kind", ["uint8", "uint16"])
+@pytest.mark.parametrize(
+    "front", ["f = Cast<to=1>(x)", "t = Transpose<perm=[0,1,2,3]>(x) f = Cast<to=1>(t)"]
+)
+def test_an_image_of_integers_is_one_of_floats(front: str, kind: str) -> None:
+    ends = f"{kind}[N,{CHANNELS},H,W] x => float[N,C,H2,W2] y"
+    model = made(f"{front} d = Div(f, six) y = {SAME}(d, w)", ends=ends)
+    short = simplify(model, "a.onnx")
+    assert "Cast" not in kinds(short)
+    image = np.random.default_rng(0).integers(0, 255, (1, CHANNELS, 9, 11))
+    (before,) = open_session(model).run(None, {"x": image.astype(kind)})
+    (after,) = open_session(short).run(None, {"x": image.astype(np.float32)})
+    np.testing.assert_allclose(after, before, rtol=2e-5, atol=1e-3)
