@@ -1,4 +1,4 @@
-"""A sensor of a user's own: a shipped one, texts of its file replaced."""
+"""A user's own sensor file: a shipped file with some of its text replaced."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ SHIPPED = (HERE / "sensors" / "pleiades-degraded.toml").read_text(encoding="utf-
 
 
 def edited(*changes: tuple[str, str]) -> str:
-    """The shipped file's text, every `old` in it replaced by its `new`."""
+    """Return the shipped file's text with every `old` replaced by its `new`."""
     text = SHIPPED
     for old, new in changes:
         assert old in text
@@ -17,7 +17,7 @@ def edited(*changes: tuple[str, str]) -> str:
 
 
 def own_sensor(folder: Path, *changes: tuple[str, str], text: str | None = None) -> Path:
-    """That text, or one that is given, as mine.toml in a folder."""
+    """Write the edited text, or `text` if given, to mine.toml in `folder` and return its path."""
     path = folder / "mine.toml"
     path.write_text(edited(*changes) if text is None else text, encoding="utf-8")
     return path

@@ -1,6 +1,4 @@
-"""Errors come back whole from worker processes, which hand them over pickled; what they say can be
-read.
-"""
+"""Tests that errors survive pickling between processes and that their messages are readable."""
 
 import sys
 from importlib import import_module
@@ -29,11 +27,11 @@ from beers_deploy.profiles.errors import (
 @pytest.mark.parametrize(
     "kind", [BeersError, ImageError, MachineError, ModelError, OptionError, ProfileError]
 )
-def test_an_error_survives_the_way_between_processes(kind: type[BeersError]) -> None:
+def test_an_error_survives_pickling_between_processes(kind: type[BeersError]) -> None:
     error = kind("a.tif has no rows. Give some.")
-    come = ForkingPickler.loads(ForkingPickler.dumps(error))
-    assert type(come) is kind
-    assert str(come) == str(error) == "a.tif has no rows. Give some."
+    received = ForkingPickler.loads(ForkingPickler.dumps(error))
+    assert type(received) is kind
+    assert str(received) == str(error) == "a.tif has no rows. Give some."
 
 
 @given(st.lists(st.integers(0, 10**13), min_size=1, max_size=3))
@@ -41,7 +39,7 @@ def test_an_error_survives_the_way_between_processes(kind: type[BeersError]) -> 
 @example([310_000_000, 310_000_001])
 @example([999_999, 1_000_000])
 def test_sizes_that_differ_look_different(counts_bytes: list[int]) -> None:
-    """No "needs 0.00 GB, but there is only 0.00 GB"."""
+    """A message must not read "needs 0.00 GB, but there is only 0.00 GB"."""
     texts = sizes(*counts_bytes)
     scales = {"GB": 1e9, "MB": 1e6, "kB": 1e3, "bytes": 1}
     assert len(set(texts)) == len(set(counts_bytes))
@@ -51,7 +49,7 @@ def test_sizes_that_differ_look_different(counts_bytes: list[int]) -> None:
 
 
 @given(st.text(max_size=40))
-def test_visible_text_keeps_its_lines_and_nothing_that_is_obeyed(text: str) -> None:
+def test_visible_text_keeps_its_lines_but_no_control_characters(text: str) -> None:
     shown_text = visible(text)
     assert all(c.isprintable() or c in "\n\t" for c in shown_text)
     assert shown_text.count("\n") == text.count("\n")
@@ -61,7 +59,7 @@ def test_visible_text_keeps_its_lines_and_nothing_that_is_obeyed(text: str) -> N
 @pytest.mark.parametrize(
     "lacks", ["import dateutil_of_nobody", "raise ImportError('libexpat.so.1: no such file')"]
 )
-def test_a_package_that_cannot_load_is_one_sentence_and_no_fault_of_the_program(
+def test_a_package_that_cannot_load_gets_one_sentence(
     lacks: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "pystac.py").write_text(lacks, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What a user may write into a profile by mistake: each is one sentence that says what to do."""
+"""Tests that each mistake in a profile is refused in one sentence that says what to do."""
 
 from itertools import product
 from pathlib import Path
@@ -21,9 +21,7 @@ for name, ways in TABLES.items():
 
 
 def refusal(path: Path, *words: str) -> str:
-    """Return the message, after checking that it names the file, has these words and ends like a
-    sentence.
-    """
+    """Return the error message; check that it names the file, has `words` and ends in one stop."""
     with pytest.raises(ProfileError) as caught:
         Sensor.load(path)
     message = str(caught.value)
@@ -75,7 +73,7 @@ def test_text_that_is_not_unicode_is_refused(tmp_path: Path) -> None:
     ],
 )
 def test_a_range_is_drawn_from_or_refused(old: str, new: str, tmp_path: Path) -> None:
-    """Never accepted and then quietly cut to its lower end."""
+    """A range must not be accepted and then silently cut to its lower end."""
     try:
         profile = Sensor.load(own_sensor(tmp_path, (old, new)))
     except ProfileError:
@@ -87,10 +85,10 @@ def test_a_range_is_drawn_from_or_refused(old: str, new: str, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("snr_0", "snr_1"), [(55.0, 110.0), (27.5, 110.0), (34.3, 68.6), (13.7, 27.4), (83.2, 166.4)]
 )
-def test_what_loads_can_be_drawn_at_the_very_bounds(
+def test_a_profile_at_the_bounds_of_the_snr_can_be_drawn(
     snr_0: float, snr_1: float, tmp_path: Path
 ) -> None:
-    """There alpha or beta is 0, and rounding may leave it a hair below."""
+    """At a bound, alpha or beta is 0, and rounding could make it slightly negative."""
     assert snr_0 in snr_0_bounds(25, 100, snr_1)
     path = own_sensor(
         tmp_path, ("value = 50,", f"value = {snr_0},"), ("value = 110,", f"value = {snr_1},")
@@ -140,7 +138,7 @@ def test_a_fault_in_a_table_of_contrasts_has_its_dotted_key(tmp_path: Path) -> N
 def test_noise_reproduces_any_two_points(
     radiance_0: float, factor: float, snr_0: float, snr_1: float
 ) -> None:
-    """Whatever the signs of alpha and beta: the line passes through both variances."""
+    """The noise line passes through both variances, whatever the signs of alpha and beta."""
     radiance_1 = factor * radiance_0
     alpha, beta = noise_from_snr(radiance_0, snr_0, radiance_1, snr_1)
     scale = max((radiance_0 / snr_0) ** 2, (radiance_1 / snr_1) ** 2)

@@ -1,6 +1,4 @@
-"""A tabulated MTF and a point-spread function: read, compared, kept, and
-refused in one sentence.
-"""
+"""Tests that MTF tables and point-spread functions are read, compared, saved and refused."""
 
 import json
 import math
@@ -28,9 +26,7 @@ PSF = 'psf = "psf.npy"\npsf_samples_per_px = 4'
 
 
 def lopsided(rows: int = 33, columns: int = 44) -> np.ndarray:
-    """A point's image of other widths down and right, leaning, with a one-sided tail: (rows,
-    columns).
-    """
+    """Return a sheared point spread (rows, columns) with two widths and a one-sided tail."""
     y, x = np.mgrid[:rows, :columns] - np.array([rows - 1, columns - 1])[:, None, None] / 2
     samples: np.ndarray = np.exp(-(y**2) / 18 - (x + 0.4 * y) ** 2 / 10)
     samples += 0.1 * np.exp(-(y**2) / 30 - (x - 3) ** 2 / 30)
@@ -38,7 +34,7 @@ def lopsided(rows: int = 33, columns: int = 44) -> np.ndarray:
 
 
 def sensor_file(folder: Path, mtf: str, noise: str | None = None) -> Path:
-    """The nominal sensor with another [mtf], and another [noise] where one is given."""
+    """Write the shipped sensor with another [mtf], and another [noise] if given."""
     text = re.sub(r"\[mtf\].*?(?=\n\[)", lambda _: f"[mtf]\n{mtf}\n", SHIPPED, flags=re.DOTALL)
     if noise is not None:
         text = re.sub(
@@ -56,7 +52,7 @@ def formula(frequency: np.ndarray, contrast: float) -> np.ndarray:
     return np.asarray(np.exp(2 * np.log(contrast * np.pi / 2) * frequency) * np.sinc(frequency))
 
 
-def test_a_table_says_what_stands_in_it(tmp_path: Path) -> None:
+def test_a_table_returns_its_own_values(tmp_path: Path) -> None:
     profile = Sensor.load(sensor_file(tmp_path, TABLE))
     sensor = profile.nominal()
     f = np.array([[0.0, 0.25, 0.5]])
@@ -88,9 +84,7 @@ def test_a_table_never_rises_beyond_its_end(
 
 
 def test_a_point_spread_is_its_transform_about_its_centroid(tmp_path: Path) -> None:
-    """Against a padded FFT, whose frequencies are multiples of 4 / 96 cycles per pixel, shifted by
-    hand.
-    """
+    """The reference is a padded FFT at multiples of 4 / 96 cycles per pixel, shifted by hand."""
     samples = lopsided(24, 32)
     sensor = with_psf(tmp_path, samples).nominal()
     row, column = centroid(samples)
@@ -106,7 +100,7 @@ def test_a_point_spread_is_its_transform_about_its_centroid(tmp_path: Path) -> N
     assert sensor.mtf_axes == pytest.approx((across, along), abs=3e-6)
 
 
-def test_beyond_its_own_sampling_a_point_spread_says_nothing(tmp_path: Path) -> None:
+def test_beyond_its_own_nyquist_frequency_a_point_spread_is_0(tmp_path: Path) -> None:
     response = with_psf(tmp_path, lopsided()).response
     assert response is not None
     contrasts = response.at(np.array([[1.9, 2.1, 4.0]]), np.zeros((1, 1)))[0]
@@ -169,7 +163,7 @@ def test_a_profile_comes_back_from_json_without_its_file(
     assert not same_instrument(other, profile)
 
 
-def test_another_contrast_beside_a_response_is_refused(tmp_path: Path) -> None:
+def test_a_contrast_that_contradicts_the_response_is_refused(tmp_path: Path) -> None:
     sensor = Sensor.load(sensor_file(tmp_path, TABLE)).nominal()
     with pytest.raises(ValueError, match="but the response has"):
         replace(sensor, mtf_nyquist=0.2)
@@ -216,7 +210,7 @@ def test_a_wrong_blur_gets_one_sentence(mtf: str, words: tuple[str, ...], tmp_pa
     refusal(sensor_file(tmp_path / "in", mtf), *words)
 
 
-def spoilt(change: Callable[[np.ndarray], object]) -> np.ndarray:
+def corrupted(change: Callable[[np.ndarray], object]) -> np.ndarray:
     samples = lopsided()
     change(samples)
     return samples
@@ -225,7 +219,7 @@ def spoilt(change: Callable[[np.ndarray], object]) -> np.ndarray:
 @pytest.mark.parametrize(
     ("samples", "words"),
     [
-        (spoilt(lambda s: s.__setitem__((3, 4), np.nan)), ("finite", "NaN")),
+        (corrupted(lambda s: s.__setitem__((3, 4), np.nan)), ("finite", "NaN")),
         (-lopsided(), ("sum is above 0",)),
         (np.zeros((5, 5)), ("their sum is 0.",)),
         (np.stack([lopsided()] * 3), ("(rows, columns)", "(3, 33, 44)")),
@@ -260,7 +254,7 @@ def test_alpha_and_beta_are_the_noise_itself(tmp_path: Path) -> None:
         sensor_file(tmp_path, "mtf_nyquist = 0.07", f"alpha = {alpha}\nbeta = {beta}")
     )
     assert profile.nominal() == plain.nominal()
-    # The radiances are shares of the shipped full scale, 400.
+    # The default radiances are 1/16 and 1/4 of full scale, which is 400 for the shipped sensor.
     assert (profile.radiance_0.low, profile.radiance_1.low) == (25, 100)
     ranged = Sensor.load(
         sensor_file(tmp_path, "mtf_nyquist = 0.07", "alpha = [0.1, 0.2]\nbeta = 0\nradiance_1 = 60")

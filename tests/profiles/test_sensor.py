@@ -135,7 +135,7 @@ def test_impossible_pairs_are_counted() -> None:
     rng = np.random.default_rng(0)
     rejected = sum(profile.draw_counted(rng)[1] for _ in range(400))
     share = rejected / (rejected + 400)
-    # Of the pairs, 24.9 % are valid.
+    # 24.9 % of the drawn pairs are valid.
     assert 0.70 < share < 0.80
 
 
@@ -154,7 +154,7 @@ def with_table(folder: Path, table: str) -> Path:
     return own_sensor(folder, text=f"{text}\n{table}")
 
 
-def test_a_table_calls_for_its_effect(tmp_path: Path) -> None:
+def test_a_table_adds_its_effect(tmp_path: Path) -> None:
     profile = Sensor.load(with_table(tmp_path, "[smear]\nlength_px = [0.2, 0.4]\n"))
     smears = [profile.draw(np.random.default_rng(s)).effects["smear"] for s in range(5)]
     lengths = {effect.length_px for effect in smears if isinstance(effect, Smear)}

@@ -1,4 +1,4 @@
-"""docs/reference/sensor-profile.md names every key of a profile, with its range, and no other."""
+"""Tests that docs/reference/sensor-profile.md names every key of a profile, with its range."""
 
 import math
 import re
@@ -23,7 +23,7 @@ PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "sensor-profile.md").
     encoding="utf-8"
 )
 ROWS = dict(re.findall(r"^- `(\[\w+\] \w+)` \(.+?; (.+?)\): .+$", PAGE, re.MULTILINE))
-"""The range of each key."""
+"""The range of each key, as the page states it."""
 
 
 def test_the_page_has_every_key_and_no_other() -> None:
@@ -73,7 +73,7 @@ def test_the_example_of_the_page_is_a_profile(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("part", "axes"), [*zip(PARTS, [(0.11, 0.08), (0.2, 0.1), (0.05, 0.05)], strict=True)]
 )
-def test_each_other_way_of_the_page_fits_into_the_example(
+def test_each_alternative_of_the_page_fits_into_the_example(
     part: str, axes: tuple[float, float], tmp_path: Path
 ) -> None:
     x = np.arange(-20, 21) / 8

@@ -1,4 +1,4 @@
-"""Every number of a board's file is one that a board can have."""
+"""Tests that a board's file accepts only keys and numbers that a board can have."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ FOREIGN = [
     ("measurement", "min_time_s"),
     ("file", "opset_max"),
 ]
-"""Keys of a host or an NPU, which nothing reads for a DPU."""
+"""Keys of a host or an NPU, which are unknown keys for a DPU."""
 PLACES = list[tuple[str, str]]()
 for name, keys in KEYS.items():
     PLACES += [(name, key) for key in keys if (name, key) not in FOREIGN]
@@ -28,7 +28,7 @@ NOT_NUMBERS = ("nan", "-inf", '"16"', "true", "[]", "[1, 2, 3]", "{}", "1979-05-
 
 
 def board(folder: Path, table: str, key: str, value: str) -> str:
-    """A board like the VCK190 but for one key."""
+    """Write the file of a board that differs from the VCK190 in one key, and return its path."""
     path = folder / "my-board.toml"
     name = "configurations.C32B3" if table == BUILD else table
     path.write_text(
@@ -39,9 +39,7 @@ def board(folder: Path, table: str, key: str, value: str) -> str:
 
 @st.composite
 def outside(draw: st.DrawFn, limits: Limits) -> float:
-    """A number that the key cannot have: too small, too large, or broken where
-    it counts something.
-    """
+    """Draw a number that the key cannot have: too small, too large, or a fraction of a count."""
     kinds = [
         st.floats(-1e300, limits.low, exclude_max=True),
         st.floats(limits.high, 1e300, exclude_min=True),
@@ -71,7 +69,7 @@ def test_a_number_that_no_board_has_is_refused(
 
 
 @given(place=ANY_KEY, value=st.sampled_from(NOT_NUMBERS))
-def test_what_is_no_number_is_refused(
+def test_a_value_that_is_no_number_is_refused(
     place: tuple[str, str], value: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     message = refusal(board(tmp_path_factory.mktemp("board"), *place, value))
@@ -80,7 +78,7 @@ def test_what_is_no_number_is_refused(
 
 
 @given(data=st.data(), place=ANY_KEY)
-def test_every_number_within_the_limits_is_taken(
+def test_every_number_within_the_limits_is_accepted(
     data: st.DataObject, place: tuple[str, str], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     limits = LIMITS[place[1]]

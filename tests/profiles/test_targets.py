@@ -1,4 +1,4 @@
-"""A board after another: a file that names its base states what differs, and nothing else."""
+"""Tests of board files, most of which name a base and state only what differs from it."""
 
 import re
 from pathlib import Path
@@ -17,7 +17,7 @@ PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "boards.md").read_tex
 (EXAMPLE,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
 
 
-def written(folder: Path, text: str) -> str:
+def write_board(folder: Path, text: str) -> str:
     path = folder / "my-board.toml"
     path.write_text(text, encoding="utf-8")
     return str(path)
@@ -29,8 +29,8 @@ def test_the_boards_are_the_targets_with_a_dpu() -> None:
     ]
 
 
-def test_the_pages_board_is_the_zcu102_but_for_what_it_states(tmp_path: Path) -> None:
-    mine = load_dpu(written(tmp_path, EXAMPLE))
+def test_the_board_of_the_page_differs_from_the_zcu102_only_where_it_says(tmp_path: Path) -> None:
+    mine = load_dpu(write_board(tmp_path, EXAMPLE))
     base = load_dpu("zcu102", "B2304")
     assert (mine.name, mine.cores, mine.batch) == ("B2304", 2, 2)
     assert mine.engine_ops_per_s == pytest.approx(2304 * 250e6)
@@ -65,7 +65,7 @@ def test_a_wrong_board_gets_one_sentence(
 ) -> None:
     assert old in EXAMPLE
     with pytest.raises(ProfileError) as caught:
-        load_dpu(written(tmp_path, EXAMPLE.replace(old, new)))
+        load_dpu(write_board(tmp_path, EXAMPLE.replace(old, new)))
     assert "\n" not in str(caught.value)
     for word in ("my-board", *words):
         assert word in str(caught.value)
@@ -77,7 +77,7 @@ def test_a_misspelt_constant_does_not_silence_its_rule(tmp_path: Path) -> None:
         .read_text(encoding="utf-8")
         .replace("\narea_max =", "\narea_mox =")
     )
-    output = done("check", "--tile", "64", "--target", written(tmp_path, text), code=2)
+    output = done("check", "--tile", "64", "--target", write_board(tmp_path, text), code=2)
     assert "[conv]" in output
     assert "'area_mox'" in output
     assert output.count("\n") == 1
@@ -87,25 +87,25 @@ def test_a_board_without_a_base_names_its_documents(tmp_path: Path) -> None:
     text = (HERE / "targets" / "vek280.toml").read_text(encoding="utf-8")
     without = re.sub(r"\[documents].*?\n\n", "", text, flags=re.DOTALL)
     with pytest.raises(ProfileError, match=r"my-board has no table \[documents\]"):
-        load_dpu(written(tmp_path, without))
+        load_dpu(write_board(tmp_path, without))
 
 
-def test_without_cost_constants_what_predicts_refuses_and_the_rest_works(tmp_path: Path) -> None:
+def test_without_cost_constants_only_predictions_are_refused(tmp_path: Path) -> None:
     text = (HERE / "targets" / "vck190.toml").read_text(encoding="utf-8")
-    path = written(tmp_path, re.sub(r"\n\[cost].*?\n\n", "\n", text, flags=re.DOTALL))
+    path = write_board(tmp_path, re.sub(r"\n\[cost].*?\n\n", "\n", text, flags=re.DOTALL))
     done("check", "--tile", "64", "--target", path)
     assert "no cost constants yet" in refused(
         "stress", "--bit-flips", "--target", path, "--side", "32"
     )
 
 
-def test_a_target_without_a_dpu_is_told_the_boards() -> None:
+def test_the_refusal_of_a_target_without_a_dpu_names_the_boards() -> None:
     with pytest.raises(BeersError, match=", ".join(board_names())):
         load_dpu("host-cpu")
 
 
 @pytest.mark.parametrize("name", board_names())
-def test_check_takes_every_board_by_the_name_of_its_model(name: str) -> None:
+def test_check_accepts_every_board_by_the_name_of_its_model(name: str) -> None:
     output = done("check", "--tile", "64", "--target", f"{name}-model")
     assert f"on {name} {load_dpu(name).name}" in " ".join(output.split())
 

@@ -1,5 +1,6 @@
-"""TOML and JSON that would hang, exhaust memory or end in a traceback."""
+"""Tests of TOML and JSON that would hang, exhaust memory or end in a traceback."""
 
+import json
 import os
 import sys
 from pathlib import Path
@@ -32,7 +33,7 @@ BAD_TOML = {
 
 
 @pytest.mark.parametrize("name", BAD_TOML)
-def test_hostile_toml_is_a_sentence_in_a_moment(name: str, tmp_path: Path) -> None:
+def test_hostile_toml_is_refused_in_one_sentence(name: str, tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(BAD_TOML[name])
     with pytest.raises(ValueError, match=r"."):
@@ -95,9 +96,7 @@ def test_hostile_json_is_a_value_error(name: str) -> None:
         max_leaves=20,
     )
 )
-def test_what_is_plain_comes_through(value: object) -> None:
-    import json
-
+def test_plain_values_are_read_back(value: object) -> None:
     assert parse_json(json.dumps(value)) == value
 
 
