@@ -1,8 +1,7 @@
-"""What every processor must compute alike: run natively by the whole suite, and emulated by
-`.ci/emulate`.
+"""Fixtures of the tests whose results must be the same on every processor.
 
-Nothing here starts another process, which would not be emulated, or needs more than the command
-`gate` does.
+The whole suite runs them natively, and `.ci/emulate` on emulated processors. No test here starts
+another process, which would not be emulated, or needs more than the command `gate` needs.
 """
 
 from dataclasses import dataclass, replace
@@ -20,9 +19,7 @@ from tests.shipped import shipped_pair
 
 @dataclass(frozen=True)
 class Encodings:
-    """One shipped network in whole numbers: its core, the host's file, and the same core in the
-    board's encoding.
-    """
+    """A shipped integer network: its core, the host file, and the core in the board's encoding."""
 
     core: IntCore
     host: onnx.ModelProto
@@ -37,8 +34,9 @@ def shipped(request: pytest.FixtureRequest) -> Encodings:
 
 
 def with_int8_bias(core: IntCore) -> IntCore:
-    """The core of a host file, which aligns every bias to its accumulator, with the board's int8
-    bias.
+    """Return the core of a host file with the board's int8 biases.
+
+    The host's file aligns every bias to its accumulator.
     """
     return replace(
         core, ops=tuple(_unaligned(op) if isinstance(op, IntConv) else op for op in core.ops)
@@ -46,7 +44,7 @@ def with_int8_bias(core: IntCore) -> IntCore:
 
 
 def _unaligned(op: IntConv) -> IntConv:
-    """Bits that no bias of the layer uses are what it was shifted by."""
+    """Undo the alignment: the low bits that no bias of the layer uses are its shift."""
     used = int(np.bitwise_or.reduce(op.bias)) or 1
     shift = (used & -used).bit_length() - 1
     bias = op.bias >> shift

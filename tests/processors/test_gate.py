@@ -1,4 +1,4 @@
-"""`gate` on the shipped pairs: passed as they are, failed once a weight is another."""
+"""Tests that `gate` passes the shipped pairs and fails a pair with changed weights."""
 
 from pathlib import Path
 
@@ -11,9 +11,7 @@ from tests.shipped import shipped_pair
 
 
 def gate(scenes: Path, *pair: object, code: int = 0) -> str:
-    """The command's words on one patch of 128 x 128: emulated float networks
-    take seconds for each.
-    """
+    """Return the output for one patch of 128 x 128, since an emulated float network is slow."""
     return done(f"gate --images {scenes} --patches 1", *pair, code=code)
 
 
@@ -22,7 +20,7 @@ def test_a_shipped_pair_passes(name: str, scenes: Path) -> None:
     assert "gate passed" in gate(scenes, name)
 
 
-def test_a_broken_one_fails(scenes: Path, tmp_path: Path) -> None:
+def test_a_broken_pair_fails(scenes: Path, tmp_path: Path) -> None:
     float_path, int8_path = shipped_pair("convbeers-xs")
     model = load_onnx(int8_path)
     weight = next(t for t in model.graph.initializer if t.name == "tail.weight")

@@ -1,4 +1,4 @@
-"""`restore` gives the pixels of the integer reference, for any tiles and threads."""
+"""Tests that `restore` gives the pixels of the integer reference for any tiles and threads."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def raw(height: int, width: int) -> np.ndarray:
 
 
 def by_reference(dn: np.ndarray, name: str) -> np.ndarray:
-    """Restore digital numbers (H, W) by integers alone."""
+    """Restore digital numbers (H, W) with the integer reference."""
     core = read_core(load_onnx(shipped_pair(name)[1]))
     image = (dn.astype(np.float32) / MAX_DN)[None, None]
     tensors, _ = run_core(core, core.host_part.encode(image), half_even=True)
