@@ -1,4 +1,4 @@
-"""A small network with real structure, quantised, and the stress subject that it makes."""
+"""Fixtures: a small network, its quantized form, and the stress subjects made from them."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +20,7 @@ from tests.quant.quick import drawn, quickly
 
 @pytest.fixture(autouse=True)
 def one_thread() -> Iterator[None]:
-    """On images this small a second thread only waits."""
+    """Use one thread: on images this small a second one only waits."""
     with one_thread_per_operation():
         yield
 
@@ -33,7 +33,7 @@ def network() -> ConvBEERS:
 def small_network(variant: Variant) -> ConvBEERS:
     created = plain(variant, seed=3)
     with torch.no_grad():
-        # A trained network keeps flat ground. A small tail makes a new one nearly do so.
+        # A trained network leaves flat ground unchanged; with a small tail a new one nearly does.
         created.tail.weight.mul_(0.03)
     return created
 
@@ -56,11 +56,11 @@ def quickly_quantized(float_onnx: onnx.ModelProto) -> Quantized:
 def pair(
     float_onnx: onnx.ModelProto, quantized: Quantized, tmp_path_factory: pytest.TempPathFactory
 ) -> list[Path]:
-    """The two files."""
-    return saved(float_onnx, quantized, tmp_path_factory.mktemp("pair"))
+    """Return the paths of the float and the INT8 file."""
+    return save_pair(float_onnx, quantized, tmp_path_factory.mktemp("pair"))
 
 
-def saved(float_onnx: onnx.ModelProto, quantized: Quantized, folder: Path) -> list[Path]:
+def save_pair(float_onnx: onnx.ModelProto, quantized: Quantized, folder: Path) -> list[Path]:
     paths = [folder / "float.onnx", folder / "int8.onnx"]
     for model, path in zip((float_onnx, quantized.host), paths, strict=True):
         save_onnx(model, path)
@@ -74,7 +74,7 @@ def subject(pair: list[Path]) -> Subject:
 
 @pytest.fixture(scope="session")
 def coarse(tmp_path_factory: pytest.TempPathFactory) -> Subject:
-    """A network at half resolution, in both precisions."""
+    """Return a network at half resolution, in both precisions."""
     model = to_onnx(small_network(Variant(blocks=1, features=8, scale=2)), {"variant": "test"})
-    paths = saved(model, quickly_quantized(model), tmp_path_factory.mktemp("coarse"))
+    paths = save_pair(model, quickly_quantized(model), tmp_path_factory.mktemp("coarse"))
     return open_subject(paths[0], paths[1])

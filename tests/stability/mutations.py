@@ -1,9 +1,9 @@
 """Break a copy of this code ten times, and print which stability tests notice.
 
-Run `python -m tests.stability.mutations` from the repository root; it takes some minutes. Each time
-one or two lines of the product change, as mutations.toml says, and the files of stability tests
-that it names run on the copy. The tests named there must fail; unbroken, every one must pass. The
-exit code is 1 if a broken version survives. A test keeps the list true to the code.
+Run `python -m tests.stability.mutations` from the repository root; it takes some minutes. Each
+mutation in mutations.toml changes one or two lines of the product, and the stability tests listed
+there run on the copy. The tests of a mutation must fail; without a mutation all must pass. The
+exit code is 1 if a mutation survives. test_mutations.py checks that the list fits the code.
 """
 
 import os
@@ -38,7 +38,7 @@ def test_the_copy_is_what_runs():
 """
 
 Failures = Mapping[str, int]
-"""Of each test that failed, `file::function`, the number of its cases that did."""
+"""The number of failed cases of each test that failed, by `file::function`."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +61,12 @@ def broken(text: str, mutation: Mutation) -> str:
     """Return the text of a file with the mutation.
 
     Raises:
-        SystemExit: what should change does not stand there just once.
+        SystemExit: a text to be replaced does not occur exactly once.
     """
     for old, new in mutation.changes:
         if text.count(old) != 1:
             raise SystemExit(
-                f"{mutation.name}: in {mutation.file} `{old}` stands {text.count(old)} times, "
+                f"{mutation.name}: in {mutation.file} `{old}` occurs {text.count(old)} times, "
                 "not once"
             )
         text = text.replace(old, new)
@@ -109,7 +109,7 @@ def failures(copy: Path) -> Failures:
     """Return the tests of the copy that fail, in the files that the list names.
 
     Raises:
-        SystemExit: they could not be run, or ran somebody else's code.
+        SystemExit: the tests could not run, or ran code outside the copy.
     """
     names = set[str]().union(*(mutation.tests for mutation in MUTATIONS))
     files = {name.partition("::")[0] for name in names}
@@ -127,7 +127,7 @@ def failures(copy: Path) -> Failures:
         raise SystemExit(process.stdout + process.stderr)
     tests = Counter(FAILED.findall(process.stdout))
     if any(name.startswith(PROBE_FILE) for name in tests):
-        raise SystemExit(f"not the code of {copy} is what runs there")
+        raise SystemExit(f"the tests in {copy} run code outside of it")
     return tests
 
 
@@ -143,7 +143,7 @@ def main() -> int:
     lines = []
     with repository_copy() as copy, steps("breaking", len(MUTATIONS) + 1) as bar:
         if failing := failures(copy):
-            raise SystemExit(f"unbroken, these fail: {', '.join(failing)}")
+            raise SystemExit(f"these fail without a mutation: {', '.join(failing)}")
         bar.advance()
         for mutation in MUTATIONS:
             lines.append(summary(mutation, failures_of(copy, mutation)))

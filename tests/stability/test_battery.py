@@ -1,4 +1,4 @@
-"""The battery passes what is sound, and stops what is broken."""
+"""Tests that the stress battery passes valid networks and fails broken ones."""
 
 import re
 from collections.abc import Callable
@@ -29,7 +29,7 @@ BY_NAME = {case.name: case for case in CASES}
 SIDE_PX = 32
 
 
-def look(subject: Subject, names: list[str], stages: tuple[str, ...]) -> list[StageResult]:
+def run_cases(subject: Subject, names: list[str], stages: tuple[str, ...]) -> list[StageResult]:
     return run_battery(subject, [BY_NAME[name] for name in names], stages, side_px=SIDE_PX)
 
 
@@ -37,7 +37,7 @@ def look(subject: Subject, names: list[str], stages: tuple[str, ...]) -> list[St
     "case", [case for case in CASES if not case.large], ids=lambda case: str(case.name)
 )
 def test_a_small_network_passes_every_case(case: Case, subject: Subject) -> None:
-    results = look(subject, [case.name], tuple(STAGES))
+    results = run_cases(subject, [case.name], tuple(STAGES))
     assert not [(o.stage, o.verdict, o.reason) for o in results if o.failed]
 
 
@@ -45,15 +45,15 @@ def test_a_small_network_passes_every_case(case: Case, subject: Subject) -> None
     "name", ["full scale", "steps", "NaN pixels", "nodata stripes", "1 x 1", "flat 1 x N"]
 )
 def test_a_network_at_half_resolution_passes(name: str, coarse: Subject) -> None:
-    """At odd sizes too, which are extended to whole places."""
-    results = look(coarse, [name], tuple(STAGES))
+    """Odd sizes are included: they are extended to a multiple of the network's scale."""
+    results = run_cases(coarse, [name], tuple(STAGES))
     assert not [(o.stage, o.verdict, o.reason) for o in results if o.failed or o.reason]
     assert any(o.measures for o in results if o.stage != "INT8 reference")
 
 
 @pytest.mark.parametrize("variant", ["convbeers-half", "convbeers-half-xs"])
 def test_the_shipped_networks_at_half_resolution_are_calm(variant: str) -> None:
-    """A checkerboard is four even planes to them: one that nothing holds answered it with black."""
+    """To them a checkerboard is four flat planes; an unconstrained network turned it black."""
     subject = open_subject(variant)
     checks = [BY_NAME[name] for name in ("checkerboard", "Siemens star", "SNR 3")]
     results = run_battery(subject, checks, ["float32", "INT8"], side_px=96)
@@ -102,7 +102,7 @@ def test_a_broken_float_network_fails(
     tmp_path: Path,
 ) -> None:
     save_onnx(changed(float_onnx, name, change), tmp_path / "broken.onnx")
-    (result,) = look(open_subject(tmp_path / "broken.onnx"), [case], ("float32",))
+    (result,) = run_cases(open_subject(tmp_path / "broken.onnx"), [case], ("float32",))
     assert any(measure.check.startswith(check) for measure in result.failed), result.verdict
 
 
@@ -117,7 +117,7 @@ def test_a_network_with_a_nan_among_its_weights_is_not_opened(
 def test_a_broken_int8_network_fails(pair: list[Path], tmp_path: Path) -> None:
     corrupted = changed(onnx.load(pair[1]), "tail.bias", lambda bias: bias + 10_000_000)
     save_onnx(corrupted, tmp_path / "broken.onnx")
-    results = look(open_subject(pair[0], tmp_path / "broken.onnx"), ["deciles"], ("INT8",))
+    results = run_cases(open_subject(pair[0], tmp_path / "broken.onnx"), ["deciles"], ("INT8",))
     assert {"mean moved"} <= {measure.check for measure in results[0].failed}
 
 
@@ -135,7 +135,7 @@ def test_networks_of_several_bands_or_another_size_are_refused(
 
 
 def test_a_halo_one_pixel_short_fails(subject: Subject) -> None:
-    """Of the network's receptive radius: tile plans differ."""
+    """With a halo one pixel below the network's receptive radius, tile plans differ."""
     image = BY_NAME["no noise"].draw(48, np.random.default_rng(0))[0]
     radius_px = subject.float32.tiling.halo_px
     at_once = subject.float32.restore(image)
@@ -161,7 +161,7 @@ def test_a_limitation_explains_no_more_than_its_ceiling() -> None:
     assert elsewhere.failed
 
 
-def test_ringing_is_what_leaves_the_range_around() -> None:
+def test_ringing_is_the_excess_over_the_local_range() -> None:
     source = np.zeros((9, 9), np.float32)
     source[:, 5:] = 1000
     low, high = local_range(source, 1)
@@ -173,7 +173,7 @@ def test_ringing_is_what_leaves_the_range_around() -> None:
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: str(case.name))
-def test_cases_are_drawn_from_their_seed_and_say_what_is_wrong_with_them(case: Case) -> None:
+def test_cases_repeat_for_a_seed_and_state_whether_their_pixels_are_valid(case: Case) -> None:
     first, second = (case.draw(24, np.random.default_rng(7)) for _ in range(2))
     for image, repeated in zip(first, second, strict=True):
         np.testing.assert_array_equal(image, repeated)
@@ -220,7 +220,7 @@ def test_bad_input_is_one_sentence(arguments: list[str], words: str, pair: list[
 
 
 def test_the_page_of_stability_is_fresh() -> None:
-    """It has each case, each stage and each limitation, and nothing that failed."""
+    """The page has every case, stage and limitation, and no failure."""
     page = maker.TARGET.read_text(encoding="utf-8")
     blocks = [maker.OPENING.strip(), *maker.limitation_lines()]
     assert [text for text in blocks if text.strip() not in page] == []

@@ -1,4 +1,4 @@
-"""Bit flips: what an injection costs, what guards buy back, and what the board pays for them."""
+"""Tests of bit flips: the loss by injections, the gain by guards, and their cost on the board."""
 
 import json
 from dataclasses import replace
@@ -50,7 +50,7 @@ SOURCE = Calibration(Sensor.load("pleiades-degraded"), None, patches=2, patch_px
 
 @pytest.fixture(scope="module")
 def target() -> FaultTarget:
-    """A trained network: what a new one makes is hardly worse with bits flipped."""
+    """Return a trained network; flipped bits hardly change the quality of an untrained one."""
     return make_target(open_subject("convbeers-xs"), SOURCE)
 
 
@@ -65,7 +65,7 @@ def db(row: Row, guards: str) -> float:
     return value
 
 
-def test_flips_cost_more_the_more_there_are(rows: dict[str, Row]) -> None:
+def test_few_flips_cost_nothing_and_many_lower_the_psnr(rows: dict[str, Row]) -> None:
     clean = db(rows["none"], "no guard")
     for memory in ("weights", "maps", "image"):
         levels_db = [db(rows[name_of(memory, rate)], "no guard") for rate in MEMORIES[memory].rates]
@@ -74,7 +74,7 @@ def test_flips_cost_more_the_more_there_are(rows: dict[str, Row]) -> None:
     assert db(rows[name_of("shifts", 10_000)], "no guard") <= clean
 
 
-def test_scrubbing_and_majority_bring_the_fault_free_network_back(rows: dict[str, Row]) -> None:
+def test_scrubbing_and_majority_restore_the_fault_free_network(rows: dict[str, Row]) -> None:
     for rate in MEMORIES["weights"].rates:
         assert db(rows[name_of("weights", rate)], "all guards") == db(rows["none"], "all guards")
     assert db(rows[name_of("shifts", 1000)], "all guards") == db(rows["none"], "all guards")
@@ -105,7 +105,7 @@ def test_an_injection_leaves_the_target_alone(memory: str, target: FaultTarget) 
     )
 
 
-def test_at_half_resolution_maps_have_a_bit_for_each_channel_of_each_place(coarse: Subject) -> None:
+def test_at_half_resolution_maps_have_8_bits_per_channel_and_place(coarse: Subject) -> None:
     target = make_target(coarse, SOURCE)
     image, _ = target.pairs[0]
     result = restored(Injected(target.core, SOUND, target.pairs[0][0], 0))
@@ -176,7 +176,7 @@ def test_wrong_arguments(
 
 
 def test_the_page_is_fresh() -> None:
-    """Prices need no injections; the measured rows are counted."""
+    """Costs on the board are predicted again; the rows of measurements are only counted."""
     page = (maker.DOCS / "explanation" / "bit-flips.md").read_text(encoding="utf-8")
     assert page.startswith(maker.OPENING + maker.FINDINGS)
     dpu = load_dpu("vck190", None)
@@ -188,7 +188,7 @@ def test_the_page_is_fresh() -> None:
         assert page.count(f"\n| {name}, ") == len(memory.rates)
 
 
-def test_curves_go_from_left_to_right(rows: dict[str, Row]) -> None:
+def test_the_points_of_a_curve_ascend_in_x(rows: dict[str, Row]) -> None:
     picture = ET.fromstring(flip_curves_svg({"a": list(rows.values())}))  # noqa: S314 - our own
     lines = picture.findall(f"{CURVES}/{SVG}path[1]")
     assert lines

@@ -1,4 +1,4 @@
-"""Proofs: intervals of whole numbers that no image leaves, and sums that cannot overflow."""
+"""Tests of proven bounds: no image leaves the integer intervals, and no accumulator overflows."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -60,7 +60,9 @@ def test_a_core_is_read_back_from_its_file(quantized: Quantized) -> None:
     )
 
 
-def test_another_spelling_has_no_core(quantized: Quantized, float_onnx: onnx.ModelProto) -> None:
+def test_models_in_other_encodings_have_no_core(
+    quantized: Quantized, float_onnx: onnx.ModelProto
+) -> None:
     for model in (float_onnx, board_model(quantized.core, {})):
         with pytest.raises(ModelError, match="does not describe its integers"):
             read_core(model)

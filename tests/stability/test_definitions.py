@@ -1,6 +1,4 @@
-"""Arithmetic against its definition, written another way: SSIM's variances, a bias in whole
-numbers, an inverse.
-"""
+"""Tests of SSIM, integer biases and MTF compensation against independent definitions."""
 
 from dataclasses import replace
 
@@ -25,7 +23,7 @@ from tests.model.simulator.stages import with_contrast
 
 
 def ssim_by_two_passes(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
-    """Variances as means of squared distances from the mean: nothing large is subtracted."""
+    """Return SSIM with two-pass variances, which subtract no large numbers from each other."""
     offset = np.arange(-SSIM_RADIUS_PX, SSIM_RADIUS_PX + 1)
     side = np.exp(-0.5 * (offset / SSIM_SIGMA_PX) ** 2)
     weights = np.outer(side, side) / side.sum() ** 2
@@ -61,7 +59,7 @@ def test_ssim_is_that_of_its_definition(
 
 
 def biased(core: IntCore, generator: np.random.Generator) -> IntCore:
-    """The core with a bias of its own in every convolution, at any scale that the DPU can shift."""
+    """Return the core with random int8 biases, at random scales that the DPU can shift."""
     ops = []
     for op in core.ops:
         if isinstance(op, IntConv):

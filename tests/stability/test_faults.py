@@ -1,6 +1,4 @@
-"""Bit flips: as many as were asked for, wherever they fall; and guards, which keep what they
-promise.
-"""
+"""Tests of the number and place of injected bit flips, and of what the guards promise."""
 
 from dataclasses import replace
 
@@ -46,7 +44,7 @@ KINDS = {
 }
 
 
-def flipped(a: np.ndarray, b: np.ndarray, bits: int) -> int:
+def count_flips(a: np.ndarray, b: np.ndarray, bits: int) -> int:
     difference = (a.astype(np.int64) ^ b.astype(np.int64)) & ((1 << bits) - 1)
     return sum(int(value).bit_count() for value in difference.ravel())
 
@@ -57,21 +55,23 @@ def core(quantized: Quantized) -> IntCore:
 
 
 @given(st.sampled_from(sorted(KINDS)), st.integers(0, 2**32 - 1), st.data())
-def test_so_many_bits_are_flipped_and_no_more(kind: str, seed: int, data: st.DataObject) -> None:
+def test_exactly_the_given_number_of_bits_is_flipped(
+    kind: str, seed: int, data: st.DataObject
+) -> None:
     dtype, bits = KINDS[kind]
     low, high = (0, 2**bits) if kind == "pixels" else (-(2 ** (bits - 1)), 2 ** (bits - 1))
     values = np.random.default_rng(seed).integers(low, high, (3, 7)).astype(dtype)
     count = data.draw(st.integers(0, values.size * bits))
     injected = flip_bits(values, count, np.random.default_rng(seed), bits)
-    assert flipped(values, injected, bits) == count
+    assert count_flips(values, injected, bits) == count
     assert injected.dtype == values.dtype
     assert low <= injected.min() <= injected.max() < high
     repeated = flip_bits(values, count, np.random.default_rng(seed), bits)
     np.testing.assert_array_equal(injected, repeated)
 
 
-def test_the_rate_is_that_of_a_megabit() -> None:
-    """Poisson's standard deviation is the root of the mean."""
+def test_the_rate_is_per_million_bits() -> None:
+    """The standard deviation of a Poisson distribution is the root of its mean."""
     counts = [flip_count(2_000_000, 50.0, np.random.default_rng(k)) for k in range(400)]
     assert np.mean(counts) == pytest.approx(100, abs=4 * 10 / 20)
     assert np.std(counts) == pytest.approx(10, rel=0.2)
@@ -95,14 +95,14 @@ def test_the_stored_bias_is_int8_and_the_network_the_same(quantized: Quantized) 
 def test_flips_fall_into_the_weights_of_all_layers(core: IntCore) -> None:
     injected = flip_weights(core, 200, np.random.default_rng(1))
     flips = {
-        a.name: flipped(a.weight, b.weight, 8) + flipped(a.bias, b.bias, 8)
+        a.name: count_flips(a.weight, b.weight, 8) + count_flips(a.bias, b.bias, 8)
         for a, b in zip(core.convolutions, injected.convolutions, strict=True)
     }
     assert sum(flips.values()) == 200
     assert sum(count > 0 for count in flips.values()) > len(flips) / 2
 
 
-def test_every_shift_is_what_the_core_uses(core: IntCore) -> None:
+def test_shifts_cover_every_operator_and_fit_their_bits(core: IntCore) -> None:
     shifts = shifts_of(core)
     assert len(shifts) == sum(2 if isinstance(op, IntConv) else 1 for op in core.ops)
     limit = 2 ** (SHIFT_BITS - 1)
@@ -146,10 +146,8 @@ def test_calibration_patches_pass_untouched(core: IntCore, guards: Guards) -> No
         np.testing.assert_array_equal(guards.limit(correction), correction)
 
 
-def test_bounds_are_the_next_ones_that_hold_what_was_seen(core: IntCore) -> None:
-    """A dark image leaves room below 96 units; a bright one fills int8, and such a ReLU gets no
-    bound.
-    """
+def test_guards_take_the_smallest_bound_above_the_calibration_peak(core: IntCore) -> None:
+    """Dark images stay below 96 units. Bright ones fill int8, and such a ReLU gets no bound."""
     dark = [IMAGE_SLICES.encode(0.1 * image(seed=seed)) for seed in range(2)]
     guards = learn_guards(core, dark)
     runs = [run_core(core, planes)[0] for planes in dark]
@@ -201,7 +199,7 @@ def test_every_single_flip_is_found_and_the_layer_scrubbed(core: IntCore, guards
             assert checksums(scrubbed(injected, core, guards.checksums)) == guards.checksums
 
 
-def test_two_copies_of_three_decide(core: IntCore) -> None:
+def test_voting_takes_the_majority_of_three_copies(core: IntCore) -> None:
     shifts = shifts_of(core)
     one, other = (flip_shifts(shifts, count, np.random.default_rng(count)) for count in (1, 4))
     assert one != shifts
@@ -225,8 +223,8 @@ def test_a_wrong_shift_is_used(core: IntCore) -> None:
             )
 
 
-def test_shifts_as_wrong_as_can_be_keep_every_sign() -> None:
-    """Nothing wraps around: bias moved left by 31, sums by 32."""
+def test_extreme_shifts_keep_every_sign() -> None:
+    """No value wraps around when the bias is shifted left by 31 and the sums by 32."""
     bias = np.array([57, 20, -3, 0], np.int8)
     op = IntConv("c", PLANES, CORRECTION, np.zeros((4, 1, 1, 1), np.int8), 0, bias, 0)
     core = IntCore((op,), {PLANES: 0, CORRECTION: 0})

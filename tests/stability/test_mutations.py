@@ -1,4 +1,4 @@
-"""mutations.toml is true to the code: what would be broken is there, and the tests that notice."""
+"""Tests that the code and the tests named in mutations.toml exist."""
 
 import re
 from pathlib import Path
@@ -23,7 +23,7 @@ def test_a_mutation_survives_unless_every_test_that_it_names_fails() -> None:
 
 
 @pytest.mark.parametrize("mutation", maker.MUTATIONS, ids=lambda mutation: mutation.name)
-def test_what_would_be_broken_stands_there_once_and_the_tests_are_there(
+def test_a_mutation_changes_one_or_two_lines_and_its_tests_exist(
     mutation: maker.Mutation,
 ) -> None:
     original = (ROOT / mutation.file).read_text(encoding="utf-8")

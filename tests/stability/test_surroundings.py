@@ -1,7 +1,6 @@
-"""What surrounds a network, on the hard cases of `stress`: simulator, traditional pipeline, losses
-and metrics.
+"""Tests of simulator, traditional pipeline, losses and metrics on the hard cases of `stress`.
 
-Figures or refusals, never a wrong number; losses and their gradients finite and bounded.
+Each returns a correct value or refuses. Losses and their gradients are finite and bounded.
 """
 
 import math
@@ -52,7 +51,7 @@ def images(case: Case, side_px: int = 32) -> list[np.ndarray]:
 
 
 def sensor_of(case: Case) -> Instrument:
-    """The profile's sensor, with the case's own MTF."""
+    """Return the shipped sensor, with the MTF of the case if it has one."""
     sensor = Sensor.load(SENSOR).nominal()
     return replace(
         sensor, mtf_nyquist={"MTF 0.1 %": 0.001, "MTF 60 %": 0.6}.get(case.name, sensor.mtf_nyquist)
@@ -60,7 +59,7 @@ def sensor_of(case: Case) -> Instrument:
 
 
 def radiance_of(image: np.ndarray, sensor: Instrument) -> np.ndarray:
-    """Each pixel as RATIO x RATIO scene pixels, W/m2/sr/um."""
+    """Repeat each pixel as RATIO x RATIO scene pixels, in W/m2/sr/um."""
     fine = np.repeat(np.repeat(np.asarray(image, np.float32), RATIO, 0), RATIO, 1)
     return np.asarray(fine / np.float32(sensor.gain_dn_per_radiance))
 
@@ -85,9 +84,7 @@ def test_the_simulator_gives_digital_numbers_and_the_same_ones_again(case: Case)
 
 @named(SOUND)
 def test_the_signal_is_that_of_the_formulas(case: Case) -> None:
-    """Before noise and digitising: its mean is kept, and it rings and amplifies no more than its
-    kernel can.
-    """
+    """Before noise and digitization the mean is kept, and the kernel bounds ringing and gain."""
     sensor = sensor_of(case)
     for image in images(case):
         dn = signal(image, sensor)
@@ -111,7 +108,7 @@ def signal(image: np.ndarray, sensor: Instrument) -> np.ndarray:
 
 
 def signal_by_formula(image: np.ndarray, sensor: Instrument) -> np.ndarray:
-    """The whole transform in float64, then the samples between two scene pixels."""
+    """Transform the whole scene in float64, and sample it between two scene pixels."""
     radiance = radiance_of(image, sensor).astype(np.float64)
     fy, fx = (np.fft.fftfreq(side) for side in radiance.shape)
     response = mtf(RATIO * fx[None, :], RATIO * fy[:, None], sensor.mtf_axes)
@@ -138,9 +135,7 @@ TRADITIONAL = (
     "beyond 12 bits",
 )
 GROUPS_DN = 200.0
-"""A change in the last bit can tip which patches NL-Bayes groups: a pixel then moves by what the
-others say.
-"""
+"""The allowed change of a pixel: a change of the last bit can make NL-Bayes group other patches."""
 
 
 @named([BY_NAME[name] for name in TRADITIONAL])
@@ -186,7 +181,7 @@ def noisy(image: np.ndarray) -> np.ndarray:
 
 
 def both(image: np.ndarray) -> tuple[Tensor, Tensor]:
-    """The noisy image and itself, (1, 1, H, W) of full scale."""
+    """Return the noisy image and the image, (1, 1, H, W) as fractions of full scale."""
     parts = (np.asarray(plane / FULL_DN, np.float32) for plane in (noisy(image), image))
     restored, reference = (torch.from_numpy(part)[None, None] for part in parts)
     return restored, reference
@@ -211,8 +206,8 @@ def test_the_loss_is_its_formula_and_its_gradient_is_bounded(case: Case) -> None
             assert torch.equal(gradient, gradient_again)
             exact = by_formula(weights, other.double(), reference.double())
             assert value == pytest.approx(exact, rel=1e-4, abs=1e-4 * NOISE_DN / FULL_DN)
-            # Of the mean size of F, orthonormal, each pixel moves every F by 1 / sqrt(pixels) at
-            # most. This is proven, not measured.
+            # A pixel moves each coefficient of an orthonormal FFT by at most 1 / sqrt(pixels), and
+            # so the mean of their sizes. This is proven, not measured.
             allowed = 1 + weights.fft * math.sqrt(gradient.numel())
             assert gradient.numel() * float(gradient.abs().max()) <= allowed * (1 + 1e-4)
 

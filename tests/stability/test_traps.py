@@ -1,6 +1,4 @@
-"""The list in traps.md is complete, and the controls that other tests lack: the trap itself,
-sprung.
-"""
+"""Tests that the list in traps.md is complete, and controls in which the naive formula fails."""
 
 import math
 import re
@@ -33,13 +31,13 @@ NAMED = re.compile(r"`(tests/[\w/]+\.py)::(\w+)`")
 
 
 def trap_rows(page: str) -> dict[int, list[tuple[str, str]]]:
-    """The tests that each numbered row of the table names."""
+    """Return the tests that each numbered row of the table names."""
     lines = [line for line in page.splitlines() if re.match(r"\| \d+ \|", line)]
     return {int(line.split("|")[1]): NAMED.findall(line) for line in lines}
 
 
 def missing_tests(rows: dict[int, list[tuple[str, str]]]) -> list[str]:
-    """Rows without a test, and tests that are not there."""
+    """Return the rows without a test, and the tests that do not exist."""
     absent = [f"{number} has no test" for number, tests in rows.items() if not tests]
     for path, name in chain.from_iterable(rows.values()):
         file = ROOT / path
@@ -66,14 +64,14 @@ def test_trap_2_the_diagonal_is_no_product_of_the_axes(mtf_nyquist: float, diago
     assert value > 1.5 * mtf_nyquist**2
 
 
-def test_trap_3_a_filter_beside_an_uncalibrated_blur_leaves_half() -> None:
+def test_trap_3_a_filter_and_an_uncalibrated_blur_leave_half() -> None:
     assert float(mtf(0.5, 0.0, 0.07, 0.4)) == pytest.approx(0.07, rel=1e-9)
     filter_gain = math.exp(-2 * (math.pi * 0.4 * 0.5) ** 2)
     assert float(mtf(0.5, 0.0, 0.07)) * filter_gain == pytest.approx(0.032, abs=5e-4)
 
 
 def contrast_of_cut_kernel(radius_px: int, frequency: float, side: int = 512) -> float:
-    """MTF at a frequency of the 7 % kernel cut at a radius and divided by its sum."""
+    """Return the MTF at a frequency of the 7 % kernel, cut at a radius and divided by its sum."""
     fy = np.fft.fftfreq(side)[:, None]
     fx = np.fft.rfftfreq(side)
     kernel = np.roll(np.fft.irfft2(mtf(fx, fy, 0.07), (side, side)), (side // 2, side // 2), (0, 1))
@@ -173,9 +171,7 @@ def test_trap_18_one_generator_for_all_would_change_every_draw() -> None:
 
 
 def test_threads_change_no_bit_of_the_compensation() -> None:
-    """A transform on several threads adds in another order: seen at this size, in 0.0002 W/m2/sr/um
-    (measured).
-    """
+    """Threads change the order of sums in an FFT: here by 0.0002 W/m2/sr/um (measured)."""
     image = torch.from_numpy(np.random.default_rng(0).uniform(0, 400, (96, 96)).astype(np.float32))[
         :60, :71
     ]
