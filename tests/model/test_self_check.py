@@ -1,5 +1,7 @@
-"""The self-check: noise alone gives a chi2 of 1 under every blur, wrong images are found, and
-windows give the whole image's blocks.
+"""Tests of the self-check.
+
+Noise alone gives a chi2 of 1 under every blur, wrong images are found, and windows give the blocks
+of the whole image.
 """
 
 from collections.abc import Callable
@@ -33,10 +35,10 @@ from tests.model.consistency.images import (
     FULL_SCALE,
     ROWS,
     SENSORS,
+    acquired,
     blurred,
     noisy,
     scene,
-    seen,
     sigma_dn,
 )
 from tests.model.simulator.stages import REFERENCE, plain_sensor
@@ -68,10 +70,9 @@ PATTERNS = (plain_sensor(prnu=Prnu(0.01), dsnu=Dsnu(8.0)), plain_sensor(striping
 
 @pytest.mark.parametrize("sensor", [*SENSORS.values(), *PATTERNS])
 def test_the_true_scene_leaves_noise_alone(sensor: Instrument) -> None:
-    """The true scene leaves the chi2 of noise for each sensor, and no block is found outside of the
-    bound.
+    """The true scene has the chi2 of noise for each sensor, and no block is outside the bound.
 
-    The bound would be of no use if blur, pattern or striping alone could pass it.
+    The bound would be useless if blur, pattern or striping alone could exceed it.
     """
     # Some blurs ring below zero at the edges of the darkest ground, where a converter clips.
     truth = 0.8 * scene() + 400
@@ -81,7 +82,7 @@ def test_the_true_scene_leaves_noise_alone(sensor: Instrument) -> None:
     result = judged(SelfCheck.of(sensor, REFERENCE), raw, truth)
     assert not result.outside.any()
     if sensor in PATTERNS:
-        # Patterns count for more than they leave in most blocks.
+        # The allowance for patterns is larger than their effect in most blocks.
         assert np.nanmax(result.chi2) < 1.1
         return
     # chi2 of n cells scatters by sqrt(2 / n).
@@ -90,9 +91,9 @@ def test_the_true_scene_leaves_noise_alone(sensor: Instrument) -> None:
 
 
 def test_the_scale_of_the_pixels_changes_nothing() -> None:
-    """Digital numbers and shares of full scale are judged the same, as users have either."""
+    """Digital numbers and fractions of full scale get the same verdict, since users have either."""
     sensor = SENSORS["offset"]
-    raw = seen(sensor)
+    raw = acquired(sensor)
     own = judged(SelfCheck.of(sensor, REFERENCE), raw, scene())
     of_shares = SelfCheck.of(sensor, REFERENCE, 1.0)
     shares = judged(of_shares, raw / FULL_SCALE, scene() / FULL_SCALE)
@@ -110,12 +111,12 @@ WRONG: dict[str, Wrong] = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_is_no_restoration_of_the_image_is_found(name: str) -> None:
+def test_wrong_restorations_are_found(name: str) -> None:
     """Wrong images are found in every block with enough texture to tell: one that is not
     restored, one that is moved, and one that is too sharp.
     """
     sensor = plain_sensor()
-    raw = seen(sensor)
+    raw = acquired(sensor)
     check = SelfCheck.of(sensor, REFERENCE)
     result = judged(check, raw, WRONG[name](raw, scene()))
     textured = judged(check, raw, scene()).sharpening >= LEAST_SHARPENING
@@ -154,7 +155,7 @@ def test_an_error_counts_by_its_size() -> None:
 def test_a_broken_block_is_found_where_it_is() -> None:
     """A single wrong block is found, and blocks out of reach of its light are not blamed."""
     sensor = plain_sensor()
-    raw = seen(sensor)
+    raw = acquired(sensor)
     broken = scene().copy()
     broken[2 * BLOCK_PX : 3 * BLOCK_PX, BLOCK_PX : 2 * BLOCK_PX] *= 1.2
     result = judged(SelfCheck.of(sensor, REFERENCE), raw, broken)
@@ -184,7 +185,7 @@ def test_windows_give_the_blocks_of_the_whole_image(down: set[int], across: set[
     """
     sensor = SENSORS["two axes"]
     check = SelfCheck.of(sensor, REFERENCE)
-    raw = seen(sensor)
+    raw = acquired(sensor)
     raw[150:160, 20:30] = np.nan
     raw[40, 200] = FULL_SCALE
     whole = judged(check, raw, scene())
@@ -201,7 +202,7 @@ def test_windows_give_the_blocks_of_the_whole_image(down: set[int], across: set[
     assert_allclose(np.concatenate(chi2), whole.chi2, rtol=0.01)
 
 
-def test_pixels_that_no_residual_is_known_of_do_not_count() -> None:
+def test_pixels_without_a_known_residual_do_not_count() -> None:
     """Missing and saturated pixels change no block out of their reach, and make none fail.
 
     The value that is stored for a missing pixel does not matter.
@@ -223,7 +224,7 @@ def test_pixels_that_no_residual_is_known_of_do_not_count() -> None:
         assert_allclose(result.chi2[unchanged], expected.chi2[unchanged], rtol=0.02)
         assert not result.outside.any()
     assert np.isnan(judged(check, hidden, scene()).chi2[1, 1])
-    # What a missing pixel is stored as is no part of the image.
+    # The stored value of a missing pixel is not part of the image.
     hidden_restored = scene().copy()
     hidden_restored[np.isnan(hidden)] = 4000
     expected = judged(check, hidden, scene())

@@ -1,7 +1,7 @@
 """Sensors, a scene and its images, for the tests of the consistency step.
 
-`blurred` computes H x apart from the code under test: by a Fourier transform of the mirrored image
-in float64.
+`blurred` computes H x independently of the code under test: by a Fourier transform of the mirrored
+image in float64.
 """
 
 from dataclasses import replace
@@ -50,15 +50,13 @@ COLUMNS = 301
 
 @cache
 def step_for(name: str) -> Consistency:
-    """The step without the one for finer detail."""
+    """Return the consistency step without the step for finer detail."""
     return replace(Consistency.of(SENSORS[name], REFERENCE), detail=None)
 
 
 @cache
 def scene() -> NDArray[np.float32]:
-    """Texture whose spectrum falls as that of photographs does, with sharp stripes: 50 to 4000 DN,
-    480 DN rms.
-    """
+    """Return texture with a spectrum as of photographs, with stripes: 50 to 4000 DN, 480 DN rms."""
     generator = np.random.default_rng(0)
     frequency = np.hypot(np.fft.fftfreq(ROWS)[:, None], np.fft.rfftfreq(COLUMNS)[None])
     spectrum = (
@@ -74,7 +72,7 @@ def scene() -> NDArray[np.float32]:
 
 
 def blurred(restored: Pixels, sensor: Instrument) -> NDArray[np.float64]:
-    """Compute H x, the image mirrored at its borders."""
+    """Compute H x with the image mirrored at its borders."""
     height, width = restored.shape
     # A mirrored image of twice the size repeats without a seam, as the transform assumes.
     mirrored = np.pad(restored.astype(np.float64), ((0, height), (0, width)), mode="symmetric")
@@ -86,7 +84,7 @@ def blurred(restored: Pixels, sensor: Instrument) -> NDArray[np.float64]:
 
 
 def sigma_dn(sensor: Instrument, signal_dn: float) -> float:
-    """Standard deviation of the noise at a signal."""
+    """Return the standard deviation of the noise at a signal."""
     light = max(signal_dn - sensor.offset_dn, 0) / sensor.gain_dn_per_radiance
     return sensor.noise_sigma(light) * sensor.gain_dn_per_radiance
 
@@ -97,8 +95,8 @@ def noisy(image: Pixels, sensor: Instrument, seed: int = 1) -> NDArray[np.float3
     return np.clip(image + noise, 0, FULL_SCALE - 1).astype(np.float32)
 
 
-def seen(sensor: Instrument) -> NDArray[np.float32]:
-    """The scene as the sensor acquires it."""
+def acquired(sensor: Instrument) -> NDArray[np.float32]:
+    """Return the scene as the sensor acquires it."""
     return noisy(blurred(scene(), sensor), sensor)
 
 

@@ -1,4 +1,4 @@
-"""The step for finer detail: when it is used, what it removes, and what it leaves alone."""
+"""Tests of the step for finer detail: when it is used, what it removes and what it keeps."""
 
 from dataclasses import replace
 
@@ -14,12 +14,12 @@ from tests.model.consistency.images import (
     INSIDE,
     SENSORS,
     Pixels,
+    acquired,
     blurred,
     corrected,
     noisy,
     rms,
     scene,
-    seen,
     sigma_dn,
 )
 from tests.model.simulator.stages import (
@@ -34,7 +34,7 @@ GAUSSIAN = with_response(plain_sensor(), gaussian_pixel(1.1, 1.1, 8, 129))
 
 
 def detail(sensor: Instrument, raw: Pixels, restored: Pixels) -> NDArray[np.float32]:
-    """What the step for finer detail adds to the consistency step."""
+    """Return what the step for finer detail adds to the consistency step."""
     step = Consistency.of(sensor, REFERENCE)
     return corrected(step, raw, restored) - corrected(replace(step, detail=None), raw, restored)
 
@@ -48,7 +48,10 @@ def test_it_is_used_where_the_curve_departs_from_the_formula(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["smear", "lopsided point", "narrow point"])
 def test_a_consistent_pair_stays(name: str) -> None:
-    """Measured: 0.4 to 2.5 DN rms of 480 DN of contrast; the control has another blur."""
+    """The change is 0.4 to 2.5 DN rms at 480 DN of contrast (measured).
+
+    The control has another blur.
+    """
     sensor = SENSORS[name]
     assert rms(detail(sensor, blurred(scene(), sensor), scene())[INSIDE]) < 3
     assert rms(detail(GAUSSIAN, blurred(scene(), sensor), scene())[INSIDE]) > 6
@@ -56,8 +59,10 @@ def test_a_consistent_pair_stays(name: str) -> None:
 
 @pytest.mark.parametrize("size_px", [1.5, 3.0])
 def test_an_error_of_detail_is_removed_in_noise(size_px: float) -> None:
-    """A restoration that amplifies a band of frequencies by a tenth too much, as behind a bank for
-    another curve: at least half of the error goes, more than by the consistency step alone.
+    """At least half of the error is removed, more than by the consistency step alone.
+
+    The restoration amplifies a band of frequencies by up to 14 % too much, as one with a filter
+    bank for another MTF curve would.
     """
     truth = scene()
     band = gaussian_filter(truth, size_px) - gaussian_filter(truth, 2 * size_px)
@@ -87,7 +92,7 @@ def test_even_ground_stays_but_for_rounding(share: float) -> None:
 
 
 def test_nothing_is_added_at_the_border_nor_next_to_unknown_or_saturated_pixels() -> None:
-    raw = seen(GAUSSIAN)
+    raw = acquired(GAUSSIAN)
     restored = scene().copy()
     restored[100:120, 130:150] = np.nan
     raw[100:120, 130:150] = 1e9
@@ -97,7 +102,7 @@ def test_nothing_is_added_at_the_border_nor_next_to_unknown_or_saturated_pixels(
     for area in (
         np.s_[:16],
         np.s_[:, :16],
-        # The last of the two blocks lies partly beyond the image.
+        # At these two borders the last block lies partly outside the image.
         np.s_[-13:],
         np.s_[:, -13:],
         np.s_[92:100, 122:158],

@@ -1,6 +1,4 @@
-"""The consistency step: what it leaves alone, what it removes, and that tiles give the whole
-image's correction.
-"""
+"""Tests of the consistency step: what it leaves unchanged and removes, also tile by tile."""
 
 from dataclasses import replace
 
@@ -21,12 +19,12 @@ from tests.model.consistency.images import (
     ROWS,
     SENSORS,
     Pixels,
+    acquired,
     blurred,
     corrected,
     noisy,
     rms,
     scene,
-    seen,
     sigma_dn,
     step_for,
 )
@@ -40,9 +38,7 @@ WITH_DETAIL = Consistency.of(SENSORS["lopsided point"], REFERENCE)
 def corrected_in_part(
     step: Consistency, raw: Pixels, restored: Pixels, cut: Cut
 ) -> NDArray[np.float32]:
-    """Compute the correction of rows and columns of an image, from as many pixels around them as it
-    must have.
-    """
+    """Compute the correction of a part of an image, from as few pixels around it as suffice."""
     height, width = restored.shape
     top, bottom, left, right = cut
     first = max(top - REACH_PX, 0), max(left - REACH_PX, 0)
@@ -58,7 +54,7 @@ def corrected_in_part(
 
 @st.composite
 def spans(draw: st.DrawFn) -> tuple[int, int, int]:
-    """The size of an image's side, and a first and last pixel of it."""
+    """Draw the size of an image's side, and the start and stop of a part of it."""
     size = draw(st.one_of(st.integers(1, 40), st.integers(41, 400)))
     start = draw(st.integers(0, size - 1))
     return size, start, draw(st.integers(start + 1, size))
@@ -106,10 +102,9 @@ def test_any_part_is_corrected_as_the_whole_image_is_bit_for_bit(
     share=st.floats(0, 1),
 )
 def test_a_constant_image_stays(name: str, height: int, width: int, share: float) -> None:
-    """Of any size, from where noise is no longer clipped at zero up to full scale, but for
-    rounding.
+    """Only rounding changes it, from where noise is no longer clipped at zero up to full scale.
 
-    Measured: 0.002 DN at most, 8 units in the last place of float32.
+    Measured: at most 0.002 DN, 8 units in the last place of float32.
     """
     step = step_for(name)
     darkest_dn = float(step.means[-1])
@@ -119,7 +114,7 @@ def test_a_constant_image_stays(name: str, height: int, width: int, share: float
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_a_consistent_pair_stays(name: str) -> None:
-    """Measured: 0.3 to 0.8 DN rms of 480 DN of contrast, of noise of 9 DN."""
+    """Measured: it changes by 0.3 to 0.8 DN rms, at a contrast of 480 DN and a noise of 9 DN."""
     restored = scene()
     sensor = SENSORS[name]
     change = corrected(step_for(name), blurred(restored, sensor), restored)[INSIDE]
@@ -132,21 +127,17 @@ ERRORS = {
     "slope": np.broadcast_to(np.linspace(-6, 6, COLUMNS), (ROWS, COLUMNS)),
     "gain": 0.01 * gaussian_filter(scene().astype(np.float64), 24),
 }
-"""Smooth errors of a restored image in DN: an offset, a slope, and a gain of
-the large structures.
-"""
+"""Smooth errors of a restored image in DN: an offset, a slope, and a gain of large structures."""
 
 
 @pytest.mark.parametrize("name", ["formula", "two axes", "lopsided point"])
 @pytest.mark.parametrize("error", ERRORS)
 def test_smooth_errors_are_removed_in_noise_and_once_is_enough(name: str, error: str) -> None:
-    """The noise is the same with the error and without it, so the difference is the error's
-    correction alone.
-    """
+    """The noise is the same with and without the error, so the difference is the error alone."""
     sensor = SENSORS[name]
     step = step_for(name)
     wrong = ERRORS[error]
-    raw = seen(sensor)
+    raw = acquired(sensor)
     without = corrected(step, raw, scene())
     restored = scene() + wrong
     change = corrected(step, raw, restored)
@@ -158,11 +149,11 @@ def test_smooth_errors_are_removed_in_noise_and_once_is_enough(name: str, error:
 
 @pytest.mark.parametrize("name", ["formula", "two axes", "lopsided point", "narrow point"])
 def test_little_noise_comes_back_on_even_ground(name: str) -> None:
-    """Measured: 0.083 sigma at first; a second application changes 0.028 to 0.037 sigma, a third
-    0.013 to 0.021.
+    """Measured: the first application adds 0.083 sigma, a second changes 0.028 to 0.037 sigma, and
+    a third 0.013 to 0.021.
 
-    Interpolation between means of blocks is no projection: it keeps half of what alternates from
-    block to block.
+    Interpolation between block means is no projection: it keeps half of what alternates from block
+    to block.
     """
     sensor = SENSORS[name]
     step = step_for(name)
@@ -190,11 +181,11 @@ def test_the_flux_of_an_erased_point_comes_back(name: str, at: tuple[int, int]) 
 
 
 HOLE = np.s_[100:200, 120:220]
-"""An area without known pixels. Its borders are no multiples of the blocks."""
+"""An area without known pixels. Its borders are not aligned with the blocks."""
 
 
 def around_hole(px: int) -> NDArray[np.bool_]:
-    """The known pixels within so many rows and columns of it."""
+    """Return a mask of the known pixels within `px` rows and columns of the hole."""
     near = np.zeros((ROWS, COLUMNS), bool)
     near[100 - px : 200 + px, 120 - px : 220 + px] = True
     near[HOLE] = False
@@ -202,11 +193,11 @@ def around_hole(px: int) -> NDArray[np.bool_]:
 
 
 def holed(name: str) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """The raw image, a restored one with smooth errors and a hole, and the correction without the
-    hole.
+    """Return the raw image, a restored one with an offset and a hole, and the correction without
+    the hole.
     """
     sensor = SENSORS[name]
-    raw = seen(sensor)
+    raw = acquired(sensor)
     restored = scene() + np.float32(5)
     without_hole = corrected(step_for(name), raw, restored)
     restored[HOLE] = np.nan
@@ -214,7 +205,7 @@ def holed(name: str) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[
 
 
 @pytest.mark.parametrize("name", ["formula", "lopsided point"])
-def test_around_a_hole_the_correction_is_nearly_the_one_without_it(name: str) -> None:
+def test_around_a_hole_the_correction_is_nearly_that_without_the_hole(name: str) -> None:
     """Measured: 0.16 to 0.24 sigma rms off from 8 to 16 px, 0.06 to 0.08 from 24 to 40 px, 0.02
     farther away.
 
@@ -248,9 +239,9 @@ def test_raw_values_of_missing_pixels_do_not_matter(value: float) -> None:
 
 @pytest.mark.parametrize("name", ["formula", "lopsided point"])
 def test_around_a_clipped_area_nothing_is_brightened(name: str) -> None:
-    """A roof of 5200 DN, clipped: its residual is no noise.
+    """The residual of a clipped roof of 5200 DN is not noise.
 
-    The control counts clipped pixels like others.
+    The control treats clipped pixels like others.
     """
     sensor = SENSORS[name]
     step = step_for(name)
@@ -273,7 +264,7 @@ def test_around_a_clipped_area_nothing_is_brightened(name: str) -> None:
 @pytest.mark.parametrize("offset_dn", [0.0, 2.0, 100.0])
 @pytest.mark.parametrize("sigmas", [0.3, 1.0, 3.0])
 def test_noise_clipped_at_zero_keeps_the_mean_of_the_dark(offset_dn: float, sigmas: float) -> None:
-    """The raw mean is up to 0.65 DN of 0.74 too bright.
+    """At a signal of 0.74 DN the raw mean is 0.65 DN too bright.
 
     The step removes all but 0.04 DN (measured).
     """

@@ -9,7 +9,7 @@ def interval(values: list[float], sites: list[str]) -> tuple[float, float]:
     return bounds
 
 
-def test_it_covers_the_mean_as_often_as_it_says() -> None:
+def test_the_interval_covers_the_mean_at_its_nominal_rate() -> None:
     generator = np.random.default_rng(1)
     hits = 0
     for _ in range(200):
@@ -21,16 +21,14 @@ def test_it_covers_the_mean_as_often_as_it_says() -> None:
 
 
 def test_images_of_one_site_are_not_taken_for_many() -> None:
-    """Ten copies of five figures tell no more than the five; drawn one by one
-    they would seem to.
-    """
+    """Ten copies of five values hold no more information than the five values."""
     values = np.repeat((38.0, 41.0, 44.0, 47.0, 50.0), 10).tolist()
     low, high = interval(values, [f"s{k // 10}" for k in range(50)])
     alone_low, alone_high = interval(values, [f"s{k}" for k in range(50)])
     assert high - low > 2 * (alone_high - alone_low)
 
 
-def test_below_five_sites_there_is_no_interval_and_it_is_said() -> None:
+def test_below_five_sites_there_is_no_interval_and_the_text_says_so() -> None:
     for count in range(1, LEAST_SITES + 2):
         values = np.linspace(40, 44, 3 * count).tolist()
         sites = [f"s{k % count}" for k in range(3 * count)]

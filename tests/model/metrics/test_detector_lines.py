@@ -1,4 +1,4 @@
-"""Lines of another gain are found with their gain; what a scene has is not."""
+"""Tests that lines of another gain are found with their gain, and lines of a scene are not."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from beers_deploy.model.metrics.detector_stripes import Stripes, judge_lines
 
 LEAST = 0.003
 SIGMA_PX = {"25 %": 0.53, "15 %": 0.62, "5 %": 0.78}
-"""Gaussian blur by its MTF at Nyquist."""
+"""The sigma of a Gaussian blur by its MTF at Nyquist."""
 seeds = st.integers(0, 2**20)
 
 
@@ -98,6 +98,6 @@ def test_a_margin_and_a_constant_image_are_no_dead_columns() -> None:
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (5, 5), (3, 200), (200, 3), (64, 7)])
 @pytest.mark.parametrize("value", [0.0, 5.0, np.nan])
-def test_what_is_too_small_or_empty_says_nothing(shape: tuple[int, int], value: float) -> None:
+def test_images_too_small_or_empty_have_no_faults(shape: tuple[int, int], value: float) -> None:
     faults = judged(np.full(shape, value))
     assert (faults.significant, faults.off, faults.dead) == (False, (), ())

@@ -1,4 +1,4 @@
-"""A pattern of two pixels is found with its size, also where it changes its sign over the image."""
+"""Tests that a pattern of two pixels is found with its size, even if it changes its sign."""
 
 from itertools import product
 
@@ -52,12 +52,12 @@ def test_a_pattern_is_found_with_its_size(
 
 @settings(deadline=None, max_examples=15)
 @given(st.integers(0, 2**20), st.integers(20, 150), st.integers(20, 150))
-def test_noise_has_none(seed: int, height: int, width: int) -> None:
+def test_noise_has_no_pattern(seed: int, height: int, width: int) -> None:
     image = np.random.default_rng(seed).normal(500, 20, (height, width))
     assert not any(pattern.significant for pattern in judged(image).values())
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (15, 40), (40, 15), (16, 16), (64, 17)])
 @pytest.mark.parametrize("value", [0.0, 5.0, np.nan])
-def test_what_is_small_constant_or_missing_has_none(shape: tuple[int, int], value: float) -> None:
+def test_small_constant_or_missing_images_have_none(shape: tuple[int, int], value: float) -> None:
     assert not any(pattern.significant for pattern in judged(np.full(shape, value)).values())

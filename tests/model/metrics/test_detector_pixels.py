@@ -1,6 +1,4 @@
-"""Dead and hot pixels are found where they are; stars, edges, texture and
-clipped ground are not.
-"""
+"""Tests that dead and hot pixels are found, but no stars, texture or clipped noise."""
 
 import numpy as np
 import pytest
@@ -20,7 +18,7 @@ def ground(seed: int, side_px: int = SIDE_PX) -> np.ndarray:
     return np.random.default_rng(seed).normal(LEVEL, NOISE, (side_px, side_px))
 
 
-def found(image: np.ndarray) -> list[tuple[int, ...]]:
+def positions(image: np.ndarray) -> list[tuple[int, ...]]:
     return [tuple(place) for place in wrong_pixels(np.rint(image).astype(np.float32), 1.0).tolist()]
 
 
@@ -34,19 +32,19 @@ def test_dead_and_hot_pixels_are_found_and_nothing_else(seed: int, row: int, col
     for value in (0, LEVEL + 100 * NOISE, 4095):
         image = ground(seed)
         image[row, column] = value
-        assert found(image) == [(row, column)]
+        assert positions(image) == [(row, column)]
 
 
 @settings(deadline=None, max_examples=25)
 @given(seeds, st.floats(0.6, 2), st.floats(50, 5000), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
-def test_a_star_is_light(
+def test_a_star_is_not_a_hot_pixel(
     seed: int, sigma_px: float, peak: float, down_px: float, right_px: float
 ) -> None:
     rows, columns = np.mgrid[:SIDE_PX, :SIDE_PX]
     distance = (rows - 45 - down_px) ** 2 + (columns - 45 - right_px) ** 2
     star = peak * np.exp(-distance / (2 * sigma_px**2))
     image = np.random.default_rng(seed).normal(LEVEL + star, np.sqrt(NOISE**2 + star / 20))
-    assert found(np.minimum(image, 4095)) == []
+    assert positions(np.minimum(image, 4095)) == []
 
 
 @settings(deadline=None, max_examples=15)
@@ -55,7 +53,7 @@ def test_blurred_texture_is_a_scene(seed: int, sigma_px: float, contrast: float)
     rough = gaussian_filter(
         np.random.default_rng(seed).standard_normal((SIDE_PX, SIDE_PX)), sigma_px
     )
-    assert found(ground(seed + 1) + contrast * rough / rough.std()) == []
+    assert positions(ground(seed + 1) + contrast * rough / rough.std()) == []
 
 
 @pytest.mark.parametrize("end", [0.0, 500.0])
@@ -63,16 +61,16 @@ def test_blurred_texture_is_a_scene(seed: int, sigma_px: float, contrast: float)
 def test_noise_that_reaches_over_an_end_of_the_range_is_noise(end: float, beyond: float) -> None:
     sign = 1 if end else -1
     image = np.random.default_rng(1).normal(end + sign * beyond * NOISE, NOISE, (400, 400))
-    assert found(np.clip(image, 0, 500)) == []
+    assert positions(np.clip(image, 0, 500)) == []
 
 
 @pytest.mark.parametrize("value", [np.nan, 7.0])
 @pytest.mark.parametrize("shape", [(1, 1), (9, 9), (8, 40), (40, 8), (10, 11)])
-def test_what_is_small_constant_or_missing_has_none(shape: tuple[int, int], value: float) -> None:
+def test_small_constant_or_missing_images_have_none(shape: tuple[int, int], value: float) -> None:
     assert not len(wrong_pixels(np.full(shape, value, np.float32)))
 
 
-def test_beside_missing_pixels_nothing_is_judged_that_lacks_its_neighbours() -> None:
+def test_a_pixel_next_to_missing_ones_is_not_judged() -> None:
     image = ground(3).astype(np.float32)
     image[40, 40] = 4095
     image[40, 41] = np.nan

@@ -30,12 +30,12 @@ def blurred(scene: np.ndarray, mtf_nyquist: Blur, smear_px: float = 0.0) -> np.n
 
 @lru_cache
 def clean(mtf_nyquist: float, angle_deg: float) -> np.ndarray:
-    """An edge through the middle, its values those of digital numbers."""
+    """Return an edge through the middle, in digital numbers."""
     return blurred(slanted_edge(SIDE_PX, RATIO, angle_deg, (40.0, 160.0)), mtf_nyquist)
 
 
 def square(image: np.ndarray, angle_deg: float, rng: np.random.Generator) -> np.ndarray:
-    """17 x 17 pixels around a place on the edge, with noise of its own."""
+    """Return 17 x 17 pixels around a random place on the edge, with new noise."""
     middle = (SIDE_PX - 1) / 2
     row = int(rng.integers(45, 75))
     column = round(middle - (row - middle) * math.tan(math.radians(angle_deg)))
@@ -51,7 +51,7 @@ def edges(mtf_nyquist: float, angle_deg: float, count: int, seed: int = 0) -> li
 
 @pytest.mark.parametrize("mtf_nyquist", [0.02, 0.05, 0.12])
 @pytest.mark.parametrize("angle_deg", [0.0, 4.0, 15.0, 30.0])
-def test_one_small_square_tells_the_blur(mtf_nyquist: float, angle_deg: float) -> None:
+def test_one_small_square_gives_the_blur(mtf_nyquist: float, angle_deg: float) -> None:
     blurs = edges(mtf_nyquist, angle_deg, 30)
     assert len(blurs) >= 25
     off = np.array([edge.gamma for edge in blurs]) - gamma_from_mtf(mtf_nyquist)
@@ -90,8 +90,8 @@ def test_a_board_shows_both_axes(lean_deg: float) -> None:
 
 
 def test_a_curve_that_falls_more_steeply_is_no_higher_at_nyquist() -> None:
-    """Smear of a pixel keeps 0.64 at Nyquist and more before: the profile's own curve would pass
-    too high there.
+    """One pixel of smear keeps 0.64 at Nyquist and more below it, so a curve of the profile's
+    formula would be too high at Nyquist.
     """
     image = board(0.1, smear_px=1.0)[10:-10, 10:-10]
     smeared = combine(find_blurs(image.T), find_blurs(image))
@@ -101,7 +101,7 @@ def test_a_curve_that_falls_more_steeply_is_no_higher_at_nyquist() -> None:
     assert smeared.nearest > 1.2 * true
 
 
-def test_clipped_edges_are_left_alone() -> None:
+def test_clipped_edges_are_ignored() -> None:
     image = board(0.07)[10:-10, 10:-10]
     assert find_blurs(image)
     assert not find_blurs(image, 1500)
@@ -109,11 +109,9 @@ def test_clipped_edges_are_left_alone() -> None:
 
 
 def test_a_landscape_has_no_such_edge() -> None:
-    """Roads, roofs and crop rows, textured: steep places by the hundred, and none that is a plain
-    step.
-    """
+    """Textured roads, roofs and crop rows have hundreds of steep places, but no plain step."""
     scene = procedural_scene(1200, 1200, np.random.default_rng(3)).radiance.copy()
-    # The landscape covers the calibration site that the scene draws.
+    # Cover the scene's calibration site, which has plain steps, with landscape.
     scene[:400] = scene[400:800]
     image = blurred(scene, 0.07)
     image = image + SIGMA * np.random.default_rng(2).standard_normal(image.shape)
@@ -125,7 +123,7 @@ def is_edge(region: np.ndarray) -> bool:
     return fit_blurs(region[None], noise, STRICT) != [None]
 
 
-def test_what_is_no_blurred_step_is_refused() -> None:
+def test_regions_other_than_a_blurred_step_are_refused() -> None:
     edge = clean(0.07, 6.0)[40:80, 40:80]
     sharpened = edge.copy()
     sharpened[:, 2:-2] += 1.5 * (2 * edge[:, 2:-2] - edge[:, :-4] - edge[:, 4:])

@@ -24,8 +24,8 @@ from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.metrics.uneven_edge import EdgePixels
 
 NOISE_DN = 4.0
-SHOWN = [2, 5, 10]
-"""Places of 0.1, 0.25 and 0.5 cycles per pixel in the table."""
+INDICES = [2, 5, 10]
+"""Indices of 0.1, 0.25 and 0.5 cycles per pixel in FREQUENCIES."""
 CURVES = {
     "exponential": np.exp(-4.0 * CORNERS),
     "gaussian": np.exp(-8.0 * CORNERS**2),
@@ -37,12 +37,12 @@ def noise(values: np.ndarray) -> np.ndarray:
     return np.full(np.shape(values), NOISE_DN**2)
 
 
-def drawn(
+def draw_region(
     weights: np.ndarray,
     generator: np.random.Generator,
     texture: float,
 ) -> np.ndarray:
-    """A region (H, W) with an edge between sloping sides, its texture some pixels wide."""
+    """Draw a region (H, W) with an edge between sloping sides, and texture some pixels wide."""
     height = 23
     width = 19
     y, x = np.mgrid[:height, :width].astype(float)
@@ -65,7 +65,7 @@ def edges_of(weights: np.ndarray, count: int, seed: int, texture: float = 0.0) -
     generator = np.random.default_rng(seed)
     edges = []
     for number in range(count):
-        edge = edge_in(drawn(weights, generator, texture), noise, f"edge {number}")
+        edge = edge_in(draw_region(weights, generator, texture), noise, f"edge {number}")
         assert not isinstance(edge, Refusal)
         edges.append(edge)
     return edges
@@ -77,7 +77,7 @@ def test_the_curve_is_found_whatever_its_shape(name: str) -> None:
     curve = measure_curve(edges_of(weights, 9, seed=2), np.random.default_rng(0))
     assert isinstance(curve, MtfCurve)
     truth = mtf_at(FREQUENCIES, weights)
-    assert curve.contrast[SHOWN] == pytest.approx(truth[SHOWN], rel=0.06)
+    assert curve.contrast[INDICES] == pytest.approx(truth[INDICES], rel=0.06)
     assert (np.diff(curve.contrast) <= 0).all()
     assert (curve.low <= curve.contrast).all()
     assert (curve.contrast <= curve.high).all()
@@ -86,7 +86,7 @@ def test_the_curve_is_found_whatever_its_shape(name: str) -> None:
 
 def test_texture_widens_the_interval_which_holds_the_truth() -> None:
     weights = weights_of(CURVES["exponential"])
-    truth = mtf_at(FREQUENCIES, weights)[SHOWN]
+    truth = mtf_at(FREQUENCIES, weights)[INDICES]
     widths = []
     covered = []
     for seed in range(4):
@@ -95,8 +95,8 @@ def test_texture_widens_the_interval_which_holds_the_truth() -> None:
                 edges_of(weights, 3, 10 + seed, texture), np.random.default_rng(0)
             )
             assert isinstance(curve, MtfCurve)
-            widths.append(curve.high[SHOWN] / curve.low[SHOWN])
-            covered.append((curve.low[SHOWN] <= truth) & (truth <= curve.high[SHOWN]))
+            widths.append(curve.high[INDICES] / curve.low[INDICES])
+            covered.append((curve.low[INDICES] <= truth) & (truth <= curve.high[INDICES]))
     assert np.mean(covered) >= 0.8
     assert (np.median(widths[1::2], axis=0) > np.median(widths[::2], axis=0)).all()
 
@@ -112,37 +112,37 @@ def test_edges_that_contradict_the_others_are_named() -> None:
     assert curve.contradicting == ("the hedge",)
 
 
-def test_search_takes_the_sharpest_and_leaves_hedges() -> None:
-    """Steps and twice as many softer edges: the steps' curve is found."""
+def test_search_keeps_the_sharpest_edges_and_leaves_hedges_out() -> None:
+    """Among steps and twice as many softer edges, the curve of the steps is found."""
     weights = weights_of(CURVES["exponential"])
     mixed = edges_of(weights, 12, seed=5)
     for number, softness_px in enumerate(np.random.default_rng(6).uniform(0.6, 4, 24)):
         mixed += edges_of(weights_of(np.exp(-(4 + softness_px) * CORNERS)), 1, seed=20 + number)
     curve = search_curve(mixed, np.random.default_rng(0))
     assert isinstance(curve, MtfCurve)
-    assert curve.contrast[SHOWN] == pytest.approx(mtf_at(FREQUENCIES, weights)[SHOWN], rel=0.1)
+    assert curve.contrast[INDICES] == pytest.approx(mtf_at(FREQUENCIES, weights)[INDICES], rel=0.1)
     few = search_curve(mixed[:2], np.random.default_rng(0))
     assert isinstance(few, Refusal)
     assert "2 straight edges" in few.reason
 
 
-def test_noise_alone_holds_no_edge() -> None:
+def test_noise_alone_has_no_edge() -> None:
     pixels = np.random.default_rng(0).normal(1000, NOISE_DN, (64, 70))
     assert find_edges(pixels, noise, 4095, "plain") == []
     assert isinstance(edge_in(pixels[:20, :20], noise, "plain"), Refusal)
 
 
 @given(st.floats(1, 6), st.floats(1, 6), st.floats(0, 0.25), st.floats(0, 0.25))
-def test_axes_are_told_apart_by_how_the_edges_lean(
+def test_axes_are_separated_by_the_lean_of_their_edges(
     x: float, y: float, lean_x: float, lean_y: float
 ) -> None:
-    """Edges that lean see both losses, added in squares; undone, each axis has its own."""
+    """A leaning edge mixes the squared losses of both axes; `apart` returns those of each axis."""
     detector = np.sinc(FREQUENCIES)
 
-    def seen(own: float, other: float, lean: float) -> MtfCurve:
+    def mixed_curve(own: float, other: float, lean: float) -> MtfCurve:
         loss = np.sqrt((1 - lean) * own**2 + lean * other**2) * FREQUENCIES
         contrast = detector * np.exp(-loss)
         return MtfCurve(contrast, contrast, contrast, 5, (), lean)
 
-    verdict = apart(seen(x, y, lean_x), seen(y, x, lean_y))
+    verdict = apart(mixed_curve(x, y, lean_x), mixed_curve(y, x, lean_y))
     assert verdict.contrast == pytest.approx(detector * np.exp(-x * FREQUENCIES), abs=1e-6)

@@ -16,7 +16,7 @@ LOSSES = st.lists(st.floats(0, 2), min_size=PARTS - 1, max_size=PARTS - 1)
 
 
 def falling(losses: list[float]) -> np.ndarray:
-    """The weights of a curve whose logarithm falls by these numbers from corner to corner."""
+    """Return the weights of a curve whose logarithm falls by `losses` from corner to corner."""
     return weights_of(np.exp(-np.cumsum([0.0, *losses])))
 
 
@@ -33,7 +33,7 @@ def test_weights_give_the_curve_at_the_corners_and_fall_between(losses: list[flo
 
 
 def edge_response(distance: np.ndarray, gamma: float) -> np.ndarray:
-    """A step of 1 at 0 behind the profile's MTF: its Fourier integral as a sum."""
+    """Return a unit step at 0 blurred by the profile's MTF, as the sum of its Fourier integral."""
     step = 1 / 64
     f = (np.arange(8 * 64) + 0.5) * step
     waves = np.exp(-gamma * f) * np.sinc(f) / (np.pi * f) * step
@@ -42,7 +42,7 @@ def edge_response(distance: np.ndarray, gamma: float) -> np.ndarray:
 
 @pytest.mark.parametrize("gamma", [2.0, 4.4, 7.0])
 def test_the_edge_is_that_of_the_profiles_formula(gamma: float) -> None:
-    """But for what corners 0.05 cycles per pixel apart leave of it, and what lies beyond 1."""
+    """The tolerance is for the corners, 0.05 cycles per pixel apart, and frequencies beyond 1."""
     distance = np.linspace(-9, 9, 73)
     weights = weights_of(np.exp(-gamma * CORNERS))
     edges, lines = responses()

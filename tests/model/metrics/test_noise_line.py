@@ -21,12 +21,12 @@ RADIANCES = (25.0, 100.0)
 
 @lru_cache
 def scenes() -> list[PreparedScene]:
-    """Two drawn landscapes, nothing on which is flat."""
+    """Return two procedural landscapes without any flat area."""
     generators = np.random.default_rng(7).spawn(2)
     return [prepare_scene(procedural_scene(1280, 1280, g).radiance, RATIO) for g in generators]
 
 
-def seen(pair: tuple[float, float], seed: int, mtf_nyquist: float = 0.07) -> Blocks:
+def acquired_blocks(pair: tuple[float, float], seed: int, mtf_nyquist: float = 0.07) -> Blocks:
     alpha, beta = noise_from_snr(RADIANCES[0], pair[0], RADIANCES[1], pair[1])
     sensor = Instrument(mtf_nyquist, alpha, beta, GAIN, 12)
     images = [acquire(scene, sensor, Draw(seed, k)) for k, scene in enumerate(scenes())]
@@ -41,7 +41,7 @@ def model(blocks: Blocks, incomplete: bool = False) -> NoiseModel:
 
 @pytest.mark.parametrize("pair", PAIRS)
 def test_the_noise_of_a_textured_landscape_is_right(pair: tuple[float, float]) -> None:
-    models = [model(seen(pair, seed)) for seed in range(3)]
+    models = [model(acquired_blocks(pair, seed)) for seed in range(3)]
     covered = []
     for radiance, snr in zip(RADIANCES, pair, strict=True):
         true = (radiance * GAIN / snr) ** 2
@@ -52,7 +52,7 @@ def test_the_noise_of_a_textured_landscape_is_right(pair: tuple[float, float]) -
 
 
 def plain(shape: tuple[int, int] = (320, 320), low: float = 200, high: float = 2200) -> np.ndarray:
-    """Stripes of eight levels, 40 pixels wide for 320."""
+    """Return stripes of eight levels, each 40 pixels wide in an image of 320 columns."""
     level = np.arange(shape[1]) * 8 // shape[1]
     return np.broadcast_to(low + (high - low) * level / 7, shape).copy()
 
@@ -65,13 +65,13 @@ def noisy(sigma: float, image: np.ndarray | None = None, seed: int = 0) -> np.nd
 
 
 @pytest.mark.parametrize("sigma", [0.6, 5.0])
-def test_the_rounding_is_taken_off(sigma: float) -> None:
+def test_the_variance_of_rounding_is_subtracted(sigma: float) -> None:
     models = [model(cut_blocks(noisy(sigma, seed=seed), MAX_DN)) for seed in range(5)]
     assert np.mean([line.at(1000).value for line in models]) == pytest.approx(sigma**2, rel=0.03)
     assert models[0].total(np.array(1000.0)) == pytest.approx(sigma**2 + 1 / 12, rel=0.1)
 
 
-def test_what_lies_beyond_the_blocks_is_less_sure() -> None:
+def test_beyond_the_blocks_the_interval_is_wider() -> None:
     line = model(cut_blocks(noisy(5.0), MAX_DN))
     inside = line.at(1000)
     outside = line.at(40)
@@ -96,7 +96,7 @@ def refused(image: np.ndarray) -> str:
     return outcome.reason
 
 
-def test_what_cannot_be_known_is_refused() -> None:
+def test_noise_that_cannot_be_measured_is_refused() -> None:
     assert "rounding alone adds" in refused(np.rint(plain()))
     assert "rounding alone adds" in refused(noisy(0.1))
     assert "too narrow" in refused(noisy(5.0, plain(low=1000, high=1100)))
@@ -106,7 +106,7 @@ def test_what_cannot_be_known_is_refused() -> None:
 
 
 def test_texture_as_sharp_as_a_pixel_is_refused() -> None:
-    """A photograph that no instrument has blurred: its texture would pass for noise."""
+    """The texture of a photograph that no instrument has blurred would pass for noise."""
     rng = np.random.default_rng(8)
     radius = np.hypot(np.fft.fftfreq(512)[:, None], np.fft.rfftfreq(512)[None, :])
     waves = np.fft.irfft2(
@@ -115,8 +115,8 @@ def test_texture_as_sharp_as_a_pixel_is_refused() -> None:
     assert "texture" in refused(np.rint(plain((512, 512)) * np.exp(0.2 * waves / waves.std())))
 
 
-def test_noise_of_one_level_is_that_of_photons_with_an_interval_that_holds_a_constant() -> None:
-    """Sky behind stars, a flat field: how the noise grows with light is not seen."""
+def test_noise_of_one_level_is_photon_noise_with_an_interval_that_holds_a_constant() -> None:
+    """Sky behind stars, or a flat field, does not show how the noise grows with light."""
     generator = np.random.default_rng(5)
     flat = generator.normal(800, 20, (320, 320))
     assert isinstance(fit_noise(cut_blocks(flat, MAX_DN)), Refusal)
@@ -131,7 +131,7 @@ def test_noise_of_one_level_is_that_of_photons_with_an_interval_that_holds_a_con
 @pytest.mark.parametrize(
     ("kernel", "stronger"), [((0.2, 0.6, 0.2), "middle"), ((-0.25, 1.0, -0.25), "finest")]
 )
-def test_noise_that_is_not_white_is_told_by_its_stronger_part(
+def test_coloured_noise_is_described_by_its_stronger_part(
     kernel: tuple[float, float, float], stronger: str
 ) -> None:
     generator = np.random.default_rng(6)

@@ -25,8 +25,8 @@ Weights = dict[str, np.ndarray]
 STEMS = {"squeeze": "squeezenet1_1", "vgg": "vgg16"}
 
 
-def made_up(network: str) -> Weights:
-    """Random weights that keep the features' size from layer to layer."""
+def random_weights(network: str) -> Weights:
+    """Return random weights that keep the size of the features from layer to layer."""
     rng = np.random.default_rng(len(network))
     weights = {}
     for name, tensor in Backbone(network).state_dict().items():
@@ -41,7 +41,7 @@ def made_up(network: str) -> Weights:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("weights")
     for network, stem in STEMS.items():
-        save_file(made_up(network), folder / f"{stem}-made-up.safetensors")
+        save_file(random_weights(network), folder / f"{stem}-made-up.safetensors")
     return folder
 
 
@@ -78,7 +78,10 @@ def as_batch(plane: np.ndarray) -> Tensor:
 def test_agrees_with_a_plain_computation(
     name: str, sides: tuple[int, int], plain: float, folder: Path
 ) -> None:
-    """In float64, layer by layer: `git show 3410fc11:tests/model/metrics/test_perceptual.py`."""
+    """The expected values were computed in float64, layer by layer.
+
+    See `git show 3410fc11:tests/model/metrics/test_perceptual.py`.
+    """
     images = pair(*sides)
     metric = load(name, folder)
     assert float(metric(*images)) == pytest.approx(plain, rel=1e-5)
@@ -145,7 +148,7 @@ def test_images_of_different_shapes_are_refused(metric: Lpips | Dists) -> None:
     ("file", "total"),
     [("lpips-squeeze", 173.4387), ("lpips-vgg", 131.8555), ("dists", 1.0)],
 )
-def test_published_weights_are_whole(file: str, total: float) -> None:
+def test_published_weights_are_complete(file: str, total: float) -> None:
     tensors = load_file(PUBLISHED / f"{file}.safetensors").values()
     assert all(tensor.min() >= 0 for tensor in tensors)
     assert sum(float(tensor.sum()) for tensor in tensors) == pytest.approx(total, rel=1e-5)
@@ -156,7 +159,7 @@ def test_published_weights_are_whole(file: str, total: float) -> None:
 
 
 class Bomb:
-    """Leaves a trace if somebody unpickles it."""
+    """An object that creates a folder when it is unpickled."""
 
     def __init__(self, trace: Path) -> None:
         self.trace = trace
@@ -168,7 +171,7 @@ class Bomb:
 def test_npz_loads_like_safetensors_at_half_precision_and_with_other_entries(
     tmp_path: Path, folder: Path
 ) -> None:
-    halves = {name: array.astype(np.float16) for name, array in made_up("squeeze").items()}
+    halves = {name: array.astype(np.float16) for name, array in random_weights("squeeze").items()}
     np.savez(tmp_path / "mine.npz", **halves, **{"classifier.1.weight": np.zeros(3)})  # type: ignore[arg-type]
     images = pair(40, 40)
     mine = Lpips.load("squeeze", tmp_path / "mine.npz")
@@ -189,7 +192,7 @@ def test_npz_loads_like_safetensors_at_half_precision_and_with_other_entries(
 def test_a_file_that_is_not_that_network_is_refused(
     tmp_path: Path, suffix: str, change: dict[str, np.ndarray | None], message: str
 ) -> None:
-    arrays = {name: a for name, a in (made_up("squeeze") | change).items() if a is not None}
+    arrays = {name: a for name, a in (random_weights("squeeze") | change).items() if a is not None}
     path = tmp_path / f"weights{suffix}"
     if suffix == ".npz":
         np.savez(path, **arrays)  # type: ignore[arg-type]
@@ -200,7 +203,7 @@ def test_a_file_that_is_not_that_network_is_refused(
 
 
 def test_a_pickle_inside_npz_is_refused_and_never_run(tmp_path: Path) -> None:
-    arrays: dict[str, np.ndarray] = dict(made_up("squeeze"))
+    arrays: dict[str, np.ndarray] = dict(random_weights("squeeze"))
     arrays["features.0.bias"] = np.array([Bomb(tmp_path / "trace")], dtype=object)
     np.savez(tmp_path / "weights.npz", **arrays)  # type: ignore[arg-type]
     with (tmp_path / "bare.npz").open("wb") as file:
@@ -219,7 +222,7 @@ def test_a_pickled_file_is_refused_with_the_way_out(tmp_path: Path, name: str) -
     assert "\n" not in str(error.value)
 
 
-def test_where_a_backbone_is_looked_for(
+def test_where_a_backbone_is_searched(
     tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv(WEIGHTS_VARIABLE, raising=False)
@@ -248,7 +251,7 @@ def squeeze(shared_data: Path) -> Lpips:
 
 
 def test_known_values_on_a_photograph(squeeze: Lpips) -> None:
-    """Computed with the `lpips` package; its noise was another draw."""
+    """The values were computed with the `lpips` package, whose noise was another draw."""
     reference = skimage.data.camera()[:256, :256] / 255
     noise = np.random.default_rng(0).standard_normal(reference.shape)
     for sigma, published in ((0.01, 0.094), (0.05, 0.369), (0.2, 0.649)):

@@ -23,9 +23,7 @@ MIDDLE = slice((SCENE_PX - SIDE_PX) // 2, (SCENE_PX + SIDE_PX) // 2)
 
 @lru_cache
 def clean(mtf_nyquist: float, angle_deg: float, antialias_px: float = 0.0) -> np.ndarray:
-    """The middle of a simulated edge, where the second edge at the wrapped
-    border no longer counts.
-    """
+    """Return the middle of a simulated edge, far from the second edge at the wrapped border."""
     scene = slanted_edge(SCENE_PX, RATIO, angle_deg)
     return blurred(scene, RATIO, mtf_nyquist, antialias_px)[MIDDLE, MIDDLE]
 
@@ -50,9 +48,7 @@ def refused(image: np.ndarray, saturated: float = math.inf) -> str:
 def gaussian_edge(
     angle_deg: float, sigma_px: float, shape: tuple[int, int] = (80, 80)
 ) -> np.ndarray:
-    """An edge that owes nothing to the simulator: the error function along the normal, 0.13 px off
-    the middle.
-    """
+    """Return an edge independent of the simulator: an error function, 0.13 px off the middle."""
     angle = math.radians(angle_deg)
     y, x = (np.arange(size) - (size - 1) / 2 + 0.13 for size in shape)
     distance = x[None, :] * math.cos(angle) + y[:, None] * math.sin(angle)
@@ -82,9 +78,7 @@ def test_noise_does_not_bias(mtf_nyquist: float, bias: float, angle_deg: float) 
 @pytest.mark.parametrize("angle_deg", [3.0, 5.0, 11.31, 14.04])
 @pytest.mark.parametrize("sigma_px", [0.4, 0.53, 0.8])
 def test_a_gaussian_edge_gives_its_mtf_wherever_it_lies(sigma_px: float, angle_deg: float) -> None:
-    """Also where 1 / 4 of a pixel a row leaves bins one-sided, and where a restoration has moved
-    its image.
-    """
+    """Bins are one-sided at 1 / 4 pixel a row, and a restoration may have moved its image."""
     expected = math.exp(-2 * (math.pi * sigma_px * 0.5) ** 2)
     image = gaussian_edge(angle_deg, sigma_px, (80, 84))
     for crop in (image[:, 2:-2], image[:, 1:-3], image[:, 3:-1]):
