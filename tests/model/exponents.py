@@ -1,4 +1,4 @@
-"""The exponents of an interval as a calibration might find them."""
+"""Exponents of an interval, as a calibration might return them."""
 
 from beers_deploy.model.interval import Exponents
 

@@ -1,4 +1,4 @@
-"""Small networks of random weights, ready to compute."""
+"""Small networks with random weights, in evaluation mode."""
 
 import torch
 
@@ -14,7 +14,7 @@ def plain(variant: Variant, seed: int = 0) -> ConvBEERS:
 
 
 def behind_a_bank(variant: Variant, spread: float) -> BankedConvBEERS:
-    """Told each sensor by biases of that standard deviation."""
+    """Return a network behind a filter bank, with sensor biases of that standard deviation."""
     network = BankedConvBEERS(variant)
     generator = torch.Generator().manual_seed(0)
     initialise(network, generator)
@@ -22,13 +22,11 @@ def behind_a_bank(variant: Variant, spread: float) -> BankedConvBEERS:
     return network.eval()
 
 
-def told_of(vectors: torch.Tensor) -> Condition:
-    """What networks are told of the sensors of some vectors (N, 4)."""
+def condition_of(vectors: torch.Tensor) -> Condition:
+    """Return the condition of a batch for the sensor vectors (N, 4)."""
     return Condition.of(vectors, [bank_of_vector(tuple(vector.tolist())) for vector in vectors])
 
 
 def radius_px(variant: Variant) -> int:
-    """How far an output pixel sees around its place: one per convolution (head, two a block, body
-    end, tail).
-    """
+    """Return the receptive radius: one place a convolution (head, two a block, body end, tail)."""
     return variant.scale * (2 * variant.blocks + 3)

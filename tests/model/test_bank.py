@@ -1,6 +1,4 @@
-"""The bank of a sensor: what its kernels keep and what its planes mean, for sensors of any blur and
-noise.
-"""
+"""Tests of a sensor's filter bank, its kernels and its planes, for any blur and noise."""
 
 from dataclasses import replace
 
@@ -39,7 +37,7 @@ CONTRAST = st.floats(0.015, 0.15)
 
 
 def sensor(across: float, along: float, snr: float = 110.0) -> Instrument:
-    """Of noise that does not grow with the light, with that SNR at a quarter of full scale."""
+    """Return a sensor with constant noise, and with that SNR at a quarter of full scale."""
     return replace(
         NOMINAL, mtf_nyquist=across, mtf_nyquist_along=along, alpha=0.0, beta=(100 / snr) ** 2
     )
@@ -66,7 +64,7 @@ def test_a_lopsided_point_spread_transposed_has_its_kernels_transposed() -> None
         network_bank(with_response(NOMINAL, point_spread)) for point_spread in (point, other)
     )
     np.testing.assert_allclose(turned.details.transpose(0, 2, 1), upright.details, atol=1e-6)
-    # The control: the kernels are not symmetric, or the test would prove nothing.
+    # Control: the kernels are not symmetric. Otherwise the test would prove nothing.
     assert np.abs(upright.details - upright.details[:, ::-1, ::-1]).max() > 0.01
 
 
@@ -87,14 +85,14 @@ def frequencies() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def response(kernel: np.ndarray) -> np.ndarray:
-    """Of a kernel (7, 7), at the frequencies of the grid."""
+    """Return the response of a kernel (7, 7) at the frequencies of the grid."""
     transfer = np.zeros((GRID, GRID))
     transfer[:SIDE_PX, :SIDE_PX] = kernel
     return np.fft.fft2(np.roll(transfer, (-(SIDE_PX // 2),) * 2, (0, 1)))
 
 
 def error(kernel: np.ndarray, instrument: Instrument, epsilon: float) -> float:
-    """What a restoration of scenes of power 1 / r^2 errs, noise of power epsilon counted."""
+    """Return the error of a restoration for scenes of power 1 / r^2 and noise of power epsilon."""
     fy, fx, r = frequencies()
     blur, target = (sensor_mtf(fx[:1], fy[:, :1], camera) for camera in (instrument, REFERENCE))
     gain = response(kernel)
@@ -128,16 +126,14 @@ def test_no_other_kernel_of_its_size_restores_better(
 
 
 @pytest.mark.parametrize(("alpha", "end"), [(0.0, 0), (1.0, 1)])
-def test_noise_beyond_what_was_trained_counts_as_the_nearest_end_of_it(
-    alpha: float, end: int
-) -> None:
+def test_noise_outside_the_trained_range_is_clamped_to_it(alpha: float, end: int) -> None:
     assert (
         network_bank(replace(NOMINAL, alpha=alpha, beta=0.0)).sigma == RANGES["sigma_bright"][end]
     )
 
 
 @pytest.mark.parametrize("scale", [1, 2, 3])
-def test_in_places_of_pixels_the_filters_give_the_same(scale: int) -> None:
+def test_filters_on_places_equal_filters_on_pixels(scale: int) -> None:
     kernels = network_bank(sensor(0.08, 0.05)).kernels
     image = torch.rand(
         1,
@@ -157,7 +153,7 @@ def test_in_places_of_pixels_the_filters_give_the_same(scale: int) -> None:
 
 @settings(max_examples=20)
 @given(CONTRAST, CONTRAST, st.floats(36, 219))
-def test_a_sensor_vector_tells_the_bank_of_its_sensor(
+def test_a_sensor_vector_gives_the_bank_of_its_sensor(
     across: float, along: float, snr: float
 ) -> None:
     instrument = sensor(across, along, snr)

@@ -5,7 +5,7 @@ from torch.nn.functional import conv2d, pad
 from beers_deploy.model.bank import bank_of_vector
 from beers_deploy.model.convbeers import ConvBEERS, for_sensor, in_steps
 from beers_deploy.model.variants import VARIANTS, Variant
-from tests.model.networks import behind_a_bank, plain, told_of
+from tests.model.networks import behind_a_bank, condition_of, plain
 
 
 @pytest.mark.parametrize(
@@ -25,9 +25,7 @@ def test_a_new_network_is_nearly_the_identity(name: str) -> None:
 
 
 def test_at_half_resolution_a_shift_by_a_place_shifts_the_result_and_a_pixel_does_not() -> None:
-    """The four pixels of a place are channels of their own: the lattice, by which tiles are cut, is
-    2.
-    """
+    """The four pixels of a place are separate channels, so tiles must be aligned to 2 pixels."""
     network = plain(Variant(1, 4, 2))
     side = 32
     image = torch.rand(1, 1, side, side, generator=torch.Generator().manual_seed(1))
@@ -49,11 +47,11 @@ def test_at_half_resolution_a_shift_by_a_place_shifts_the_result_and_a_pixel_doe
 VECTORS = torch.tensor([[-0.9, -0.8, 0.3, 0.2], [0.5, 0.1, -0.7, -0.6], [0.0, 0.9, 0.8, 0.9]])
 
 
-def test_each_image_of_a_batch_meets_its_own_sensor() -> None:
+def test_each_image_of_a_batch_uses_its_own_sensor() -> None:
     network = behind_a_bank(Variant(2, 5), 0.3)
     images = torch.rand(3, 1, 13, 17, generator=torch.Generator().manual_seed(0))
     with torch.inference_mode():
-        together = network(images, told_of(VECTORS))
+        together = network(images, condition_of(VECTORS))
         for number in range(3):
             alone, other = (
                 for_sensor(network, VECTORS[k])(images[number : number + 1])[0]
@@ -74,7 +72,7 @@ def test_a_body_that_adds_nothing_leaves_the_analytic_restoration(scale: int) ->
     expected = image + conv2d(pad(image, [3] * 4, mode="reflect"), kernel)
     with torch.inference_mode():
         torch.testing.assert_close(
-            network(image, told_of(VECTORS[1:2])), expected, rtol=0, atol=1e-6
+            network(image, condition_of(VECTORS[1:2])), expected, rtol=0, atol=1e-6
         )
 
 

@@ -1,6 +1,4 @@
-"""Curves of the MTF that training draws: such as an instrument may have, of the contrast at Nyquist
-asked for.
-"""
+"""Tests that drawn MTF curves are physically possible and have the requested Nyquist contrast."""
 
 from dataclasses import replace
 
@@ -23,7 +21,7 @@ CONTRAST = st.floats(0.015, 0.15)
 
 
 @given(CONTRAST, st.floats(0.4, 1), st.integers(0, 2**20))
-def test_a_drawn_curve_has_the_contrast_asked_for_and_is_one_that_optics_can_have(
+def test_a_drawn_curve_has_the_requested_contrast_and_is_physically_possible(
     across: float, ratio: float, seed: int
 ) -> None:
     table = draw_table(across, ratio * across, np.random.default_rng(seed))
@@ -37,8 +35,9 @@ def test_a_drawn_curve_has_the_contrast_asked_for_and_is_one_that_optics_can_hav
 
 @pytest.mark.parametrize("obscuration", OBSCURATIONS)
 def test_a_pupil_has_its_closed_form(obscuration: float) -> None:
-    """Of a clear pupil: 2 / pi (arccos s - s sqrt(1 - s^2)); an obscuration lowers the middle
-    frequencies.
+    """A clear pupil has the MTF 2 / pi (arccos s - s sqrt(1 - s^2)).
+
+    An obscuration lowers the middle frequencies.
     """
     contrast = pupil_contrast(0.2, obscuration)
     assert contrast[-1] == pytest.approx(0.2, abs=1e-3)
@@ -55,15 +54,13 @@ def test_a_pupil_has_its_closed_form(obscuration: float) -> None:
     )
 
 
-def of_curve(contrast: np.ndarray) -> Instrument:
+def with_curve(contrast: np.ndarray) -> Instrument:
     values = tuple(contrast.tolist())
     return with_response(NOMINAL, MtfTable(tuple(FREQUENCIES.tolist()), values, values))
 
 
 @given(CONTRAST, st.floats(0.4, 1), st.integers(0, 2**20))
-def test_no_sensor_that_is_drawn_departs_from_what_was_trained(
-    contrast: float, ratio: float, seed: int
-) -> None:
+def test_no_drawn_sensor_departs_from_training(contrast: float, ratio: float, seed: int) -> None:
     table = draw_table(contrast, ratio * contrast, np.random.default_rng(seed))
     sensor = with_response(NOMINAL, table)
     assert "may restore worse" not in departure(sensor, "fitted")
@@ -86,7 +83,7 @@ def test_a_curve_that_a_network_does_not_know_is_a_warning(
 ) -> None:
     formula = (0.07 / np.sinc(0.5)) ** (FREQUENCIES / 0.5) * np.sinc(FREQUENCIES)
     hill = np.exp(-(((FREQUENCIES - 0.25) / 0.1) ** 2))
-    sensor = of_curve(formula * (1 + bend * hill))
+    sensor = with_curve(formula * (1 + bend * hill))
     assert has_other_curve(sensor) == bool(behind_cut)
     expected: dict[Kernels, str] = {"cut": behind_cut, "fitted": behind_fitted}
     for kernels, words in expected.items():

@@ -1,4 +1,4 @@
-"""Exposure: which factors a sensor allows, and which pixels of an image take them."""
+"""Tests of exposure: the factors that a sensor allows, and the pixels that get each factor."""
 
 from dataclasses import fields, replace
 
@@ -37,7 +37,7 @@ FULL_SCALE = 4095.0
 
 
 def noisier(times: float) -> Instrument:
-    """The nominal sensor with so many times the noise."""
+    """Return the nominal sensor with `times` its noise."""
     return replace(NOMINAL, alpha=NOMINAL.alpha * times**2, beta=NOMINAL.beta * times**2)
 
 
@@ -63,7 +63,7 @@ def test_the_factors_of_shipped_sensors(name: str, factors: tuple[int, ...]) -> 
 
 
 @given(st.floats(0.05, 20))
-def test_an_integer_network_has_the_gain_that_training_knew_and_is_finer_by_the_rest(
+def test_an_integer_network_has_the_gain_of_training_and_is_finer_by_the_rest(
     times: float,
 ) -> None:
     """The gain has as much of a factor as the training range allows. The highest factor is the
@@ -112,7 +112,7 @@ def test_a_brightened_sensor_has_more_gain_and_is_otherwise_the_same(factor: int
 
 
 def image_of(seed: int, height: int, width: int) -> NDArray[np.float32]:
-    """Dark ground with some bright pixels, whole digital numbers."""
+    """Draw dark ground with some bright pixels, in integer digital numbers."""
     generator = np.random.default_rng(seed)
     pixels = generator.integers(0, 300, (height, width)).astype(np.float32)
     bright = generator.random((height, width)) < 0.02
@@ -125,11 +125,13 @@ sides = st.integers(1, 60)
 
 @settings(max_examples=60)
 @given(st.integers(0, 999), sides, sides, st.integers(1, 14), st.sampled_from([0.0, 120.0]))
-def test_a_pixel_takes_the_highest_factor_that_leaves_headroom(
+def test_a_pixel_gets_the_highest_factor_that_leaves_headroom(
     seed: int, height: int, width: int, radius_px: int, offset: float
 ) -> None:
-    """By a loop over pixels. So HEADROOM and the limits of edges hold within their radii, unless a
-    pixel gets the smallest factor.
+    """The reference is a loop over pixels.
+
+    HEADROOM and the limits of edges hold within their radii, unless a pixel gets the smallest
+    factor.
     """
     image = image_of(seed, height, width)
     factors = (0.5, 1, 4, 8)
@@ -173,9 +175,7 @@ def test_a_part_chooses_as_the_whole_image_does(
 
 
 def test_the_offset_is_no_light() -> None:
-    """A factor multiplies what lies above the offset: an image and its offset copy take the same
-    factors.
-    """
+    """A factor multiplies the signal above the offset, so an offset copy gets the same factors."""
     image = np.arange(0, 1200, dtype=np.float32)[None]
     plain = choose_factors(image, (1, 4, 8), 0, FULL_SCALE, 0.0)
     assert np.unique(plain).tolist() == [1, 4, 8]

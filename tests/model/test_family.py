@@ -1,4 +1,4 @@
-"""The sensors that a network is trained on, and what it is told of each."""
+"""Tests of the sensors that a network is trained on, and of their sensor vectors."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ from tests.model.simulator.stages import NOMINAL
 FAMILY = SensorFamily(NOMINAL)
 
 
-def drawn(seed: int) -> Instrument:
+def draw_sensor(seed: int) -> Instrument:
     return FAMILY.draw(np.random.default_rng(seed))
 
 
@@ -47,7 +47,9 @@ def test_the_ends_of_the_ranges_are_minus_one_and_one() -> None:
         (replace(NOMINAL, alpha=1.0), "sigma_bright"),
     ],
 )
-def test_what_lies_outside_is_moved_to_the_end_and_said(sensor: Instrument, name: str) -> None:
+def test_values_outside_the_ranges_are_clamped_with_a_warning(
+    sensor: Instrument, name: str
+) -> None:
     vector = sensor_vector(sensor)
     assert max(map(abs, vector.values)) == 1
     sentences = [sentence for sentence in vector.outside if sentence.startswith(name)]
@@ -59,7 +61,7 @@ def test_what_lies_outside_is_moved_to_the_end_and_said(sensor: Instrument, name
 @pytest.mark.parametrize(
     ("along", "warned"), [(0.027, True), (0.029, False), (0.15, False), (0.07, False)]
 )
-def test_axes_further_apart_than_any_in_training_are_said(along: float, warned: bool) -> None:
+def test_axes_further_apart_than_in_training_give_a_warning(along: float, warned: bool) -> None:
     for sensor in (
         replace(NOMINAL, mtf_nyquist_along=along),
         replace(NOMINAL, mtf_nyquist=along, mtf_nyquist_along=0.07),
@@ -72,7 +74,7 @@ def test_axes_further_apart_than_any_in_training_are_said(along: float, warned: 
 
 @given(st.integers(0, 2**20))
 def test_no_sensor_that_is_trained_on_is_clamped_or_impossible(seed: int) -> None:
-    sensor = drawn(seed)
+    sensor = draw_sensor(seed)
     assert sensor_vector(sensor).outside == ()
     assert sensor.alpha >= 0
     assert sensor.beta >= 0
@@ -82,9 +84,7 @@ def test_no_sensor_that_is_trained_on_is_clamped_or_impossible(seed: int) -> Non
 
 
 def test_no_corner_of_the_ranges_is_starved() -> None:
-    """Blurred and noisy together, and each mixture: more than one sensor in a hundred for each of
-    eight corners.
-    """
+    """Each of the four corners of blur and noise has more than 4 % of the sensors."""
     generator = np.random.default_rng(0)
     vectors = torch.stack([vector_tensor(FAMILY.draw(generator)) for _ in range(3000)])
     low = vectors[:, [0, 1, 3]] < -1 / 3
@@ -101,8 +101,8 @@ def test_no_corner_of_the_ranges_is_starved() -> None:
 
 
 @pytest.mark.parametrize("gain", [0.4, 0.7, 2.0])
-def test_the_vector_speaks_of_full_scale_whatever_the_gain(gain: float) -> None:
-    """The same digital numbers, though each stands for another radiance."""
+def test_the_vector_refers_to_full_scale_whatever_the_gain(gain: float) -> None:
+    """The digital numbers are the same, though each stands for another radiance."""
     other = replace(
         NOMINAL,
         gain_dn_per_radiance=gain * NOMINAL.gain_dn_per_radiance,

@@ -26,7 +26,7 @@ def test_text_is_the_same_bytes_on_every_system(text: str, tmp_path: Path) -> No
     ],
 )
 @pytest.mark.skipif(os.name != "posix", reason="the words are those of POSIX")
-def test_where_no_folder_can_be_made_is_said_before_any_is(
+def test_an_impossible_path_is_refused_before_any_folder_is_made(
     below: str, reason: str, tmp_path: Path
 ) -> None:
     (tmp_path / "file").touch()
@@ -39,7 +39,7 @@ def test_where_no_folder_can_be_made_is_said_before_any_is(
 
 
 @pytest.mark.parametrize("below", ["out", "new/out", "new/below/out"])
-def test_what_is_found_writable_can_be_written_and_the_asking_leaves_nothing(
+def test_a_path_found_writable_can_be_written_and_the_check_leaves_nothing(
     below: str, tmp_path: Path
 ) -> None:
     require_writable(tmp_path / below)
@@ -48,7 +48,7 @@ def test_what_is_found_writable_can_be_written_and_the_asking_leaves_nothing(
     assert (tmp_path / below).read_text(encoding="utf-8") == "text"
 
 
-def test_a_folder_is_no_file_to_write_and_a_relative_path_lies_where_the_run_is(
+def test_a_folder_is_refused_and_a_relative_path_is_accepted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -1,6 +1,4 @@
-"""Files of networks in other formats are named with what to do; no ONNX file is taken for one of
-them.
-"""
+"""Tests that other formats of networks are named with a remedy, and ONNX files are not."""
 
 import io
 from collections.abc import Callable
@@ -23,7 +21,7 @@ STATE = LAYER.state_dict()
 Write = Callable[[Path], object]
 
 
-def stored(save: Callable[..., object]) -> bytes:
+def saved_bytes(save: Callable[..., object]) -> bytes:
     stream = io.BytesIO()
     save(stream, np.ones(3))
     return stream.getvalue()
@@ -37,8 +35,8 @@ OTHERS: dict[str, tuple[Write, str]] = {
         "torch.onnx.export",
     ),
     "weights as safetensors": (lambda path: save_file(STATE, path), "beers-deploy export"),
-    "arrays of NumPy": (lambda path: path.write_bytes(stored(np.savez)), "unpack it"),
-    "an array of NumPy": (lambda path: path.write_bytes(stored(np.save)), "as ONNX"),
+    "arrays of NumPy": (lambda path: path.write_bytes(saved_bytes(np.savez)), "unpack it"),
+    "an array of NumPy": (lambda path: path.write_bytes(saved_bytes(np.save)), "as ONNX"),
     "Keras": (lambda path: path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(64)), "tf2onnx"),
     "TensorFlow Lite": (lambda path: path.write_bytes(b"\x1c\0\0\0TFL3" + bytes(64)), "--tflite"),
     "onnxruntime's own format": (
@@ -64,7 +62,7 @@ def test_another_format_is_named_with_its_remedy(name: str, suffix: str, tmp_pat
 @pytest.mark.parametrize(
     "words", [("check",), ("quantize", "--out", "out.onnx"), ("export", "--out", "o.onnx")]
 )
-def test_commands_say_what_to_do_with_a_file_of_pytorch(
+def test_commands_state_what_to_do_with_a_file_of_pytorch(
     words: tuple[str, ...], tmp_path: Path
 ) -> None:
     path = tmp_path / "network.pth"

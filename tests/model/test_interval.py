@@ -1,4 +1,4 @@
-"""The interval of a restored pixel: its half-widths and its stored form."""
+"""Tests of the interval of a restored pixel: its half-widths and its stored form."""
 
 import json
 import math
@@ -19,7 +19,7 @@ MAX_DN = float(NOMINAL.max_dn)
 
 
 def test_half_widths_follow_the_formula_and_the_units() -> None:
-    """They are those of the formula, pixel by pixel, and scale with the pixel values."""
+    """The half-widths equal the formula pixel by pixel, and scale with the pixel values."""
     generator = np.random.default_rng(3)
     pixels = generator.integers(0, 4096, (9, 11)).astype(np.uint16)
     known = np.ones(pixels.shape, bool)
@@ -33,10 +33,10 @@ def test_half_widths_follow_the_formula_and_the_units() -> None:
     t = math.log(sigma / middle)
     # The MTF of this sensor is that of the middle, so that m is 0.
     growth = (window.std() / sigma) ** (0.4 + 0.02 * n + 0.05 * t)
-    wanted = 1.8 * sigma * growth * math.exp(0.1 * n + 0.15 * t)
-    assert half[4, 5] == pytest.approx(wanted, rel=1e-6)
+    expected = 1.8 * sigma * growth * math.exp(0.1 * n + 0.15 * t)
+    assert half[4, 5] == pytest.approx(expected, rel=1e-6)
     assert half.dtype == np.float32
-    # The same image in other units, such as shares of full scale.
+    # The same image in other units, here fractions of full scale.
     scaled = INTERVAL.for_sensor(NOMINAL, 1.0, 90).of(pixels / MAX_DN, known)
     np.testing.assert_allclose(scaled * MAX_DN, half, rtol=1e-5)
 
@@ -51,10 +51,10 @@ def test_windows_need_one_pixel_of_context_and_leave_missing_pixels_out() -> Non
     # Negative control: without context the outer rows differ.
     assert (width.of(pixels[6:15], known[6:15])[0] != whole[6]).any()
     known[10, 10] = False
-    spoilt = [pixels.copy() for _ in range(3)]
-    for image, value in zip(spoilt, (0.0, MAX_DN, np.nan), strict=True):
+    corrupted = [pixels.copy() for _ in range(3)]
+    for image, value in zip(corrupted, (0.0, MAX_DN, np.nan), strict=True):
         image[10, 10] = value
-    first, *others = (width.of(image, known) for image in spoilt)
+    first, *others = (width.of(image, known) for image in corrupted)
     assert np.isnan(first[10, 10])
     assert np.isfinite(first).sum() == first.size - 1
     for half in others:

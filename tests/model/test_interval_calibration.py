@@ -1,4 +1,4 @@
-"""The calibration of an interval: its quantile, its fit and what it covers."""
+"""Tests of the calibration of an interval: its quantile, its fit and its coverage."""
 
 import math
 from dataclasses import astuple, replace
@@ -24,7 +24,7 @@ MAX_DN = float(NOMINAL.max_dn)
 
 
 def random_scores(count: int, size: int = 1, seed: int = 0) -> list[np.ndarray]:
-    """Scores of so many groups of one size, each group of another scale."""
+    """Draw the scores of `count` groups of one size, each group with another scale."""
     generator = np.random.default_rng(seed)
     return [generator.exponential(generator.uniform(0.5, 2), size) for _ in range(count)]
 
@@ -35,15 +35,15 @@ def test_the_quantile_of_single_scores_is_that_of_split_conformal_prediction(
     count: int, level: int
 ) -> None:
     scores = random_scores(count)
-    # In integers: as floats, 100 * 0.68 is not 68.
+    # The rank is computed in integers because 100 * 0.68 is not 68 in floating point.
     rank = -(-(count + 1) * level // 100)
-    wanted = math.inf if rank > count else np.sort(np.concatenate(scores))[rank - 1]
-    assert conformal_quantile(scores, level) == wanted
+    expected = math.inf if rank > count else np.sort(np.concatenate(scores))[rank - 1]
+    assert conformal_quantile(scores, level) == expected
 
 
 @pytest.mark.parametrize("level", [50, 80, 90])
 def test_the_quantile_is_that_of_puncc(level: int) -> None:
-    """DEEL's puncc gets the scores, the weights, and one infinite score for the group to come."""
+    """DEEL's puncc gets the scores, their weights, and the weight of the group to come."""
     calibration = pytest.importorskip(
         "deel.puncc.api.calibration",
         reason="puncc is not installed: it needs NumPy below 2, pandas and scikit-learn",
@@ -75,7 +75,7 @@ def test_a_new_group_is_covered_as_often_as_the_level_says() -> None:
 
 
 def sample_of(exponents: Exponents, seed: int, blur: float = 0.0, noise: float = 0.0) -> Sample:
-    """Errors whose size follows a half-width to the letter, of a sensor of that blur and noise."""
+    """Draw errors whose size follows a half-width exactly, for a sensor of that blur and noise."""
     generator = np.random.default_rng(seed)
     conditions = Conditions(blur, noise, middle_noise=5.0)
     detail = generator.uniform(0.1, 20, 4000)
@@ -88,19 +88,17 @@ def test_the_fit_finds_the_exponents_that_made_the_errors() -> None:
     blurs = np.linspace(-1.5, 0.7, 6)
     sensors = enumerate(product(blurs, blurs))
     samples = [sample_of(EXPONENTS, seed, blur, noise) for seed, (blur, noise) in sensors]
-    found = fit_exponents(samples)
-    np.testing.assert_allclose(astuple(found), astuple(EXPONENTS), atol=0.03)
+    fit = fit_exponents(samples)
+    np.testing.assert_allclose(astuple(fit), astuple(EXPONENTS), atol=0.03)
 
 
 def test_one_sensor_alone_is_fitted_by_its_detail() -> None:
-    """The terms detail times blur and times noise are then multiples of detail: together they give
-    the slope.
-    """
+    """Detail times blur and detail times noise are then multiples of detail: the sum is fitted."""
     sample = sample_of(EXPONENTS, 0, blur=-0.8, noise=0.3)
-    found = fit_exponents([sample, *(sample_of(EXPONENTS, k, -0.8, 0.3) for k in (1, 2, 3))])
-    scores = sample.scores(found)
+    fit = fit_exponents([sample, *(sample_of(EXPONENTS, k, -0.8, 0.3) for k in (1, 2, 3))])
+    scores = sample.scores(fit)
     assert np.corrcoef(np.log(sample.detail), np.log(scores))[0, 1] == pytest.approx(0, abs=0.05)
-    assert (found.blur, found.noise) == pytest.approx((0, 0), abs=1e-6)
+    assert (fit.blur, fit.noise) == pytest.approx((0, 0), abs=1e-6)
 
 
 def test_each_sensor_is_covered_whatever_the_tails_of_its_errors() -> None:
@@ -125,7 +123,7 @@ def test_images_that_are_saturated_all_over_calibrate_nothing() -> None:
             calibrated(fitted, held_out)
 
 
-def test_a_calibrated_interval_covers_what_was_held_out_and_more_by_level() -> None:
+def test_a_calibrated_interval_covers_new_errors_at_each_level() -> None:
     fitted = [sample_of(EXPONENTS, k, 0.2 * k - 1) for k in range(9)]
     held_out = [sample_of(EXPONENTS, 100 + k, 0.03 * k - 1) for k in range(60)]
     interval = calibrated(fitted, held_out)

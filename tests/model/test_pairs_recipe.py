@@ -1,4 +1,4 @@
-"""What is known of a folder of pairs travels with it."""
+"""Tests that a folder of pairs holds its recipe: the sensors, the sites and the profiles."""
 
 import json
 from dataclasses import asdict
@@ -23,9 +23,7 @@ SEVERE = Sensor.load("dior-high")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two frames of one site and one of another, two patches each, of a sensor that is not the
-    default one.
-    """
+    """Write pairs of a non-default sensor: two frames of one site and one of another."""
     here = tmp_path_factory.mktemp("pairs")
     scenes = list[Path]()
     for name in ("forest_1.png", "forest_2.png", "port_1.png"):

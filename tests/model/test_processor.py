@@ -1,4 +1,4 @@
-"""What was asked of the processor is told, and its system tells its name."""
+"""Tests of the report on the processor's int8 sums, and of the processor's name."""
 
 import os
 import platform
@@ -13,7 +13,7 @@ from beers_deploy.model import processor
 from beers_deploy.model.processor import decided, int8_adds_exactly, processor_name
 
 
-def test_what_was_asked_is_told_in_words() -> None:
+def test_the_check_of_int8_sums_is_reported() -> None:
     int8_adds_exactly()
     assert "int8 on onnxruntime" in decided()
 
@@ -21,7 +21,7 @@ def test_what_was_asked_is_told_in_words() -> None:
 NOWHERE = Path("no such file")
 
 
-def named(
+def name_from(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, cpuinfo: str, comm: str = "python3\n"
 ) -> str | None:
     (tmp_path / "comm").write_text(comm, encoding="utf-8")
@@ -50,16 +50,16 @@ ARM = "".join(CORE.format(core, part) for core, part in enumerate(["0xd03", "0xd
         ("\x00: \n:::\n", None),
     ],
 )
-def test_linux_names_it_or_nothing_does(
+def test_the_name_comes_from_cpuinfo_or_is_none(
     cpuinfo: str, name: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    assert named(monkeypatch, tmp_path, cpuinfo) == name
+    assert name_from(monkeypatch, tmp_path, cpuinfo) == name
 
 
-def test_the_processor_beneath_an_emulated_one_lends_it_no_name(
+def test_an_emulated_processor_does_not_get_the_name_of_its_host(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    assert named(monkeypatch, tmp_path, X86, comm="qemu-x86_64\n") is None
+    assert name_from(monkeypatch, tmp_path, X86, comm="qemu-x86_64\n") is None
 
 
 @pytest.mark.skipif(
@@ -75,7 +75,7 @@ def test_under_a_real_emulator_there_is_no_name() -> None:
     assert process.stdout == "None\n"
 
 
-def test_a_system_that_cannot_be_asked_gives_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_system_that_does_not_state_the_name_gives_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(processor, "COMM", NOWHERE)
     for system in ("Linux", "Darwin", "Windows", "Java", ""):
         monkeypatch.setattr(platform, "system", lambda system=system: system)

@@ -53,7 +53,7 @@ def test_a_network_comes_back_as_it_was(network: Network, tmp_path: Path) -> Non
     assert [p.name for p in path.parent.iterdir()] == ["w.safetensors"]
 
 
-def test_full_resolution_is_meant_where_no_scale_is_said(tmp_path: Path) -> None:
+def test_without_a_scale_a_network_has_full_resolution(tmp_path: Path) -> None:
     path = tmp_path / "w.safetensors"
     write_tensors(
         path, arrays(plain(Variant(1, 4)).state_dict()), {"variant": {"blocks": 1, "features": 4}}
@@ -116,12 +116,12 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", shipped_names())
-def test_the_shipped_weights_load_and_say_how_they_were_made(name: str) -> None:
+def test_the_shipped_weights_load_and_record_how_they_were_made(name: str) -> None:
     shipped = read_conditioned(shipped_weights(name))
     recipe = shipped.recipe
     assert shipped.variant == VARIANTS[load_recipe(name).variant]
     assert recipe["degraded"] == "drawn over the ranges"
-    # Recipes leave out the reference's noise; the command before them had a profile without noise.
+    # Recipes simulate the reference without noise. The older command had a noise-free profile.
     cut = shipped.kernels == "cut"
     assert recipe["reference"] == ("noise-free" if cut else "pleiades-reference")
     images = recipe["images"]
@@ -133,12 +133,10 @@ def test_the_shipped_weights_load_and_say_how_they_were_made(name: str) -> None:
 @pytest.mark.parametrize(
     "reader", [lambda path: read_tensors(path)[0], lambda path: perceptual.read_tensors(path, "ab")]
 )
-def test_what_was_read_is_a_copy(
+def test_loaded_arrays_are_copies(
     reader: Callable[[Path], Mapping[str, np.ndarray]], tmp_path: Path
 ) -> None:
-    """Windows replaces no file that is held, such as a checkpoint, and who writes into it changes
-    nothing.
-    """
+    """Windows cannot replace a mapped file, and writing to the file must not change the arrays."""
     path = tmp_path / "w.safetensors"
     tensors = {
         "a": np.arange(3, dtype=np.float32),
@@ -154,7 +152,7 @@ def test_what_was_read_is_a_copy(
 
 
 def test_others_can_read_what_is_written(tmp_path: Path) -> None:
-    """As far as the user's umask lets them: like any other new file."""
+    """A saved file has the permissions of any other new file, as the user's umask sets them."""
     (tmp_path / "plain").touch()
     save_network(tmp_path / "w.safetensors", plain(Variant(1, 4)), {})
     assert (tmp_path / "w.safetensors").stat().st_mode == (tmp_path / "plain").stat().st_mode
@@ -214,9 +212,7 @@ def test_conditioned_weights_that_lack_a_tensor_are_refused(
 
 
 def test_the_same_weights_are_the_same_bytes(tmp_path: Path) -> None:
-    """Also the header, whose keys the library shuffles; 8 keys come in order by chance once in 40
-    000 times.
-    """
+    """The library shuffles the keys of a header: 8 keys are in order once in 40 000 times."""
     header = {f"key {k}": {"ä": k} for k in range(8)}
     tensors = {
         "turned": np.arange(6.0).reshape(2, 3).T,

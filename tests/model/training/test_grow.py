@@ -7,7 +7,7 @@ from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS
 from beers_deploy.model.training.grow import N, grow
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError
-from tests.model.networks import plain, told_of
+from tests.model.networks import condition_of, plain
 
 
 def network(features: int) -> ConvBEERS:
@@ -56,7 +56,7 @@ def test_a_network_behind_a_bank_grows_for_every_sensor(variant: Variant) -> Non
     for seed, parameter in enumerate(small.parameters()):
         torch.nn.init.normal_(parameter, 0.0, 0.1, torch.Generator().manual_seed(seed))
     vectors = torch.tensor([[-1.0, -0.5, 0.2, 0.9], [0.7, 0.7, -1.0, -0.6]])
-    conditions = told_of(vectors)
+    conditions = condition_of(vectors)
     torch.testing.assert_close(
         grown(small, variant)(image(), conditions), small(image(), conditions), atol=1e-5, rtol=1e-5
     )

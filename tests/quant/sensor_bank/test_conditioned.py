@@ -37,7 +37,7 @@ from beers_deploy.quant.sensor_bank.conditioned import (
 )
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.receptive_field import tiling_of
-from tests.model.networks import told_of
+from tests.model.networks import condition_of
 from tests.quant.sensor_bank.test_filters import textured
 
 SENSORS = [
@@ -96,7 +96,7 @@ def in_int8(conditioned: ConditionedCore, vector: tuple[float, ...], image: Imag
 
 def in_float(network: BankedConvBEERS, vector: tuple[float, ...], image: Image) -> Image:
     with torch.inference_mode():
-        result = network(torch.from_numpy(image), told_of(torch.tensor([vector])))
+        result = network(torch.from_numpy(image), condition_of(torch.tensor([vector])))
     return np.asarray(result.clamp(0, 1).numpy())
 
 
@@ -144,7 +144,7 @@ def test_a_float_network_rounded_as_its_file_errs_as_that_does(
 ) -> None:
     float_network, conditioned = pair
     image = 0.3 + 0.3 * textured(46, 58, 9)
-    condition = told_of(torch.tensor([vector]))
+    condition = condition_of(torch.tensor([vector]))
     stream, *inner = (
         torch.from_numpy(values)[:, None, None]
         for values in map_steps(conditioned, weights_of(float_network))
