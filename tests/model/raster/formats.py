@@ -18,22 +18,20 @@ SPLIT = 64, 80
 
 
 def digital_numbers(bits: int = 12, bands: int = BANDS) -> np.ndarray:
-    """Noise (bands, height, width) uint16 of 0 to full scale."""
+    """Draw noise (bands, height, width) uint16 from 0 to full scale."""
     return (
         np.random.default_rng(bits).integers(0, 1 << bits, (bands, HEIGHT, WIDTH)).astype(np.uint16)
     )
 
 
 def profile(bands: int = BANDS) -> dict[str, Any]:
-    """Where the image lies: numbers that binary fractions do not hold."""
+    """Return GDAL's profile, with a place on Earth that binary fractions do not represent."""
     place = rasterio.transform.from_origin(3e5 + 1 / 3, 4.8e6 + 1 / 7, 0.7, 0.7)
     return {"crs": "EPSG:32631", "transform": place, "count": bands, "dtype": "uint16"}
 
 
 def write(path: Path, pixels: np.ndarray, driver: str, **options: Any) -> Path:
-    """An image (bands, height, width) with names and gains of its bands, where the format holds
-    them.
-    """
+    """Write an image (bands, height, width), in a GeoTIFF with names and gains of its bands."""
     bands, height, width = pixels.shape
     about = (
         profile(bands) | {"dtype": pixels.dtype.name, "width": width, "height": height} | options
@@ -50,7 +48,7 @@ def write(path: Path, pixels: np.ndarray, driver: str, **options: Any) -> Path:
 
 
 def write_mask(image: Path, known: np.ndarray) -> None:
-    """Write the mask of an image beside it, as GDAL does where the format has none."""
+    """Write the mask of an image next to it, as GDAL does if the format has none."""
     height, width = known.shape
     about = {"driver": "GTiff", "width": width, "height": height, "count": 1, "dtype": "uint8"}
     with (
@@ -63,20 +61,20 @@ def write_mask(image: Path, known: np.ndarray) -> None:
 
 
 def write_tiff(path: Path, pixels: np.ndarray, **options: Any) -> Path:
-    """A TIFF in tiles."""
+    """Write a TIFF in tiles."""
     return write(
         path, pixels, "GTiff", tiled=True, blockxsize=TILE_PX, blockysize=TILE_PX, **options
     )
 
 
 def write_jp2(path: Path, pixels: np.ndarray, **options: Any) -> Path:
-    """A lossless JPEG 2000 in tiles."""
+    """Write a lossless JPEG 2000 in tiles."""
     lossless = {"QUALITY": "100", "REVERSIBLE": "YES", "BLOCKXSIZE": TILE_PX, "BLOCKYSIZE": TILE_PX}
     return write(path, pixels, "JP2OpenJPEG", **lossless, **options)
 
 
 def write_cog(path: Path, pixels: np.ndarray) -> Path:
-    """A Cloud-Optimised GeoTIFF with overviews."""
+    """Write a Cloud-Optimized GeoTIFF with overviews."""
     write_tiff(path.with_name("plain.tif"), pixels)
     from rasterio.shutil import copy
 
@@ -96,7 +94,7 @@ def write_cog(path: Path, pixels: np.ndarray) -> Path:
 
 
 def quarters(folder: Path, pixels: np.ndarray) -> list[tuple[str, int, int, int, int]]:
-    """Four JPEG 2000 tiles in `folder`: name, row, column, height and width of each."""
+    """Write four JPEG 2000 tiles; return name, row, column, height and width of each."""
     tiles = []
     for row, rows in ((0, SPLIT[0]), (SPLIT[0], HEIGHT - SPLIT[0])):
         for column, columns in ((0, SPLIT[1]), (SPLIT[1], WIDTH - SPLIT[1])):
@@ -107,7 +105,7 @@ def quarters(folder: Path, pixels: np.ndarray) -> list[tuple[str, int, int, int,
 
 
 def write_vrt(path: Path, pixels: np.ndarray, more: str = "") -> Path:
-    """A mosaic of four tiles beside it."""
+    """Write a mosaic, with its four tiles next to it."""
     bands, height, width = pixels.shape
     tiles = quarters(path.parent, pixels)
     place = rasterio.transform.from_origin(3e5 + 1 / 3, 4.8e6 + 1 / 7, 0.7, 0.7).to_gdal()
@@ -128,7 +126,7 @@ def write_vrt(path: Path, pixels: np.ndarray, more: str = "") -> Path:
 
 
 def source(name: str, band: int, row: int, column: int, rows: int, columns: int) -> str:
-    """One tile of a mosaic."""
+    """Return the XML of one tile of a mosaic."""
     size = f'xSize="{columns}" ySize="{rows}"'
     return (
         "<SimpleSource><SourceFilename "
@@ -139,9 +137,7 @@ def source(name: str, band: int, row: int, column: int, rows: int, columns: int)
 
 
 def write_dimap(path: Path, pixels: np.ndarray, bits: int = 12, more: str = "") -> Path:
-    """A DIMAP index of two tiles beside it, one above the other, with bits, gains and rational
-    polynomials.
-    """
+    """Write a DIMAP index of two tiles, one above the other, with bits, gains and polynomials."""
     bands, height, width = pixels.shape
     for k in range(2):
         part = pixels[:, k * TILE_PX * 2 : (k + 1) * TILE_PX * 2]
@@ -208,4 +204,4 @@ FORMATS: dict[str, Writer] = {
     "a.img": lambda path, pixels: write(path, pixels, "HFA"),
     "DIM.XML": write_dimap,
 }
-"""An image of digital numbers (bands, height, width) in each format, with its tiles beside it."""
+"""Writers of an image of digital numbers (bands, height, width), one for each format."""

@@ -1,4 +1,4 @@
-"""An enlarged image lies on Earth where it came from; nodata values are those of pixels."""
+"""Tests that an enlarged image keeps its place on Earth and that pixels can have a nodata value."""
 
 from itertools import product
 from typing import Any
@@ -16,10 +16,10 @@ SIZE = st.floats(0.1, 1e3)
 
 
 @given(st.tuples(SIZE, NUMBER, NUMBER, NUMBER, SIZE, NUMBER), NUMBER, NUMBER, st.integers(1, 4))
-def test_the_pixels_of_one_share_its_middle(
+def test_the_pixels_of_an_enlarged_pixel_keep_its_middle(
     matrix: tuple[float, ...], column: float, row: float, scale: int
 ) -> None:
-    """By a transform, by ground control points, and by rational polynomials."""
+    """This holds for a transform, ground control points and rational polynomials."""
     polynomials = {"LINE_OFF": "20.5", "LINE_SCALE": "7", "SAMP_OFF": "3", "SAMP_SCALE": "2"}
     place = Place(
         transform=Affine(*matrix),
@@ -47,7 +47,7 @@ def test_the_pixels_of_one_share_its_middle(
         )
 
 
-def test_one_is_the_same_place() -> None:
+def test_a_scale_of_1_keeps_the_place() -> None:
     place = Place(rpcs=(("LINE_OFF", "1"),))
     assert place.enlarged(1) is place
 

@@ -1,4 +1,4 @@
-"""Whose pixels are 12-bit digital numbers, and whose nobody can know."""
+"""Tests of which images have 12-bit digital numbers and which need the option `full_scale`."""
 
 from itertools import product
 
@@ -24,7 +24,7 @@ def settled(kind: str, *largest: float, requested: float | None = None) -> float
         *product(["float16", "float32", "float64"], [[], [0], [0, 1, 2.5], [4095]]),
     ],
 )
-def test_deep_integers_and_floats_beyond_any_share_are_12_bit_digital_numbers(
+def test_deep_integers_and_floats_beyond_any_fraction_are_12_bit_digital_numbers(
     kind: str, largest: list[float]
 ) -> None:
     # Values above the scale are not refused here, but where pixels are read.
@@ -39,7 +39,7 @@ def test_deep_integers_and_floats_beyond_any_share_are_12_bit_digital_numbers(
         ("int8", 100, "8-bit pixels"),
     ],
 )
-def test_shares_and_8_bit_pixels_leave_it_open(kind: str, largest: float, words: str) -> None:
+def test_fractions_and_8_bit_pixels_need_the_option(kind: str, largest: float, words: str) -> None:
     with pytest.raises(ImageError, match=words) as caught:
         settled(kind, 0, largest)
     assert str(caught.value).startswith("x.tif has ")
@@ -49,7 +49,7 @@ def test_shares_and_8_bit_pixels_leave_it_open(kind: str, largest: float, words:
 @pytest.mark.parametrize(
     ("kind", "requested"), [("uint8", 255), ("float32", 0.5), ("float32", 4095), ("uint16", 1023)]
 )
-def test_what_was_asked_for_settles_it(kind: str, requested: float) -> None:
+def test_a_requested_full_scale_is_used(kind: str, requested: float) -> None:
     assert settled(kind, 0.7, requested=requested) == requested
 
 
@@ -60,7 +60,7 @@ IMPOSSIBLE = (0, -1, float("nan"), float("inf"))
     ("kind", "words", "requested"),
     [("uint16", "integer", (*IMPOSSIBLE, 0.5)), ("float32", "above 0", IMPOSSIBLE)],
 )
-def test_no_image_has_such_a_full_scale(
+def test_an_impossible_full_scale_is_refused(
     kind: str, words: str, requested: tuple[float, ...]
 ) -> None:
     for full_scale in requested:
@@ -68,14 +68,14 @@ def test_no_image_has_such_a_full_scale(
             settled(kind, 1000, requested=full_scale)
 
 
-def test_no_more_is_looked_at_than_decides() -> None:
+def test_no_more_parts_are_read_than_needed() -> None:
     parts = (Extent(value, whole=False) for value in (0.0, 0.9, 3000.0, 4000.0, 5000.0))
     assert settled_scale("x", np.dtype("float32"), parts) == MAX_DN
     assert settled_scale("x", np.dtype("uint16"), parts) == MAX_DN
     assert next(parts).largest == 4000
 
 
-def test_floats_that_may_be_radiances_leave_it_open() -> None:
+def test_floats_that_may_be_radiances_need_the_option() -> None:
     digital = np.random.default_rng(0).integers(0, 1700, (40, 40)).astype(np.float32)
     for pixels in (digital, digital * 2.1):
         assert settled_scale("x", pixels.dtype, [extent_of(pixels)]) == MAX_DN
@@ -84,6 +84,6 @@ def test_floats_that_may_be_radiances_leave_it_open() -> None:
             settled_scale("x", pixels.dtype, [extent_of(pixels)])
 
 
-def test_who_has_no_such_option_says_what_else_to_do() -> None:
+def test_a_caller_without_the_option_states_its_own_remedy() -> None:
     with pytest.raises(ImageError, match=r"\. Rescale it\.$"):
         settled_scale("x", np.dtype("uint8"), (), remedy="Rescale it.")

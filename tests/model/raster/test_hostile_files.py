@@ -1,4 +1,4 @@
-"""Images whose headers would make a decoder take memory, open other files or run other programs."""
+"""Tests of headers that would make a decoder fill memory, open other files or run programs."""
 
 import struct
 import subprocess
@@ -21,19 +21,19 @@ GREY = np.random.default_rng(0).integers(0, 250, (16, 16)).astype(np.uint8)
 
 
 def tiff(path: Path, data: bytes, **changed: int) -> Path:
-    """A TIFF of one strip of 16 x 16 bytes, with entries of the names changed or added."""
+    """Write a TIFF of one strip of 16 x 16 bytes, with the named entries changed or added."""
     names = {"width": 256, "height": 257, "bits": 258, "compression": 259, "samples": 277}
     names |= {"rows": 278, "size": 279, "tile_width": 322, "tile_height": 323}
     entries = {256: 16, 257: 16, 258: 8, 259: 1, 262: 1, 273: 0, 277: 1, 278: 16, 279: len(data)}
     entries |= {names[name]: value for name, value in changed.items()}
     place = 273
-    if 322 in entries:  # Tiles have tags of their own for places and lengths, 324 and 325.
+    if 322 in entries:  # Tiles have other tags for offsets and lengths, 324 and 325.
         place = 324
         entries[325] = entries.pop(279)
         del entries[273], entries[278]
         entries[place] = 0
-    # The pixels come behind the header of 8 bytes, the count of 2 and the directory of 12 bytes an
-    # entry, which 4 bytes end.
+    # The pixels follow the header of 8 bytes, the count of 2, and the directory of 12 bytes an
+    # entry, which ends with 4 bytes.
     entries[place] = 8 + 2 + 12 * len(entries) + 4
     listed = b"".join(
         struct.pack("<HHII", tag, 4, 1, value) for tag, value in sorted(entries.items())
@@ -53,7 +53,7 @@ def little_memory() -> Iterator[None]:
 
 
 def refused(path: Path, error: type[BeersError], word: str) -> None:
-    """By both readers, in a sentence and without memory."""
+    """Check that both readers refuse the file without filling memory."""
     with little_memory():
         for reader in (read_pixels, rows):
             with pytest.raises(error, match=word):
@@ -66,7 +66,7 @@ def rows(path: Path) -> np.ndarray:
 
 
 @pytest.mark.parametrize("compression", [50002, 34925, 34887, 50001])
-def test_pixels_that_no_codec_unpacks_are_one_sentence(compression: int, tmp_path: Path) -> None:
+def test_pixels_that_no_codec_unpacks_are_refused(compression: int, tmp_path: Path) -> None:
     path = tiff(tmp_path / "a.tif", GREY.tobytes(), compression=compression)
     refused(path, ImageError, "a readable TIFF")
 
@@ -96,7 +96,7 @@ def test_an_image_too_long_to_be_planned_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("side", [2_000_000, 2**31 - 1])
 def test_a_gigantic_png_header_allocates_nothing(side: int, tmp_path: Path) -> None:
-    """A small file whose header claims another size."""
+    """The header of the small file states another size."""
     path = tmp_path / "huge.png"
     header = struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)
     Image.fromarray(GREY).save(path)
@@ -110,14 +110,14 @@ def test_a_gigantic_png_header_allocates_nothing(side: int, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("side", [2_000_000, 2**31, 2**32 - 1])
 def test_a_gigantic_tiff_header_allocates_nothing(side: int, tmp_path: Path) -> None:
-    """The last two: the number of pixels does not fit 63 bits, or only just."""
+    """For the last two sides the number of pixels only just fits 63 bits, or does not."""
     path = tiff(tmp_path / "huge.tif", bytes(4), width=side, height=side, rows=side, bits=16)
     with little_memory(), pytest.raises(BeersError, match=r"readable|free memory"):
         read_pixels(path)
 
 
 def test_other_files_that_a_microscopes_tiff_names_are_not_opened(tmp_path: Path) -> None:
-    """OME-XML says which file a plane lies in: `../secret.tif` is as good as any."""
+    """OME-XML states the file of each plane, which can be any path such as `../secret.tif`."""
     tifffile.imwrite(tmp_path / "secret.tif", np.full((16, 16), 77, np.uint8), ome=True)
     folder = tmp_path / "in"
     folder.mkdir()
@@ -137,10 +137,10 @@ def test_other_files_that_a_microscopes_tiff_names_are_not_opened(tmp_path: Path
     np.testing.assert_array_equal(rows(folder / "a.tif")[0], GREY)
 
 
-def test_what_is_no_png_or_jpeg_starts_no_other_program(
+def test_a_file_that_is_no_png_or_jpeg_starts_no_other_program(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Pillow hands EPS to Ghostscript, whatever the file is called."""
+    """Pillow passes EPS to Ghostscript, whatever the suffix of the file."""
 
     def started(*_: object, **__: object) -> None:
         raise AssertionError("a program was started")

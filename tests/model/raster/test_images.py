@@ -41,7 +41,7 @@ def radiance_of(path: Path, pixels: np.ndarray) -> np.ndarray:
 
 
 def test_scenes_become_radiance(tmp_path: Path) -> None:
-    """White is full scale, the sRGB value 188 half of its light, and bands weigh evenly."""
+    """White is full scale, sRGB 188 is half of its light, and bands have equal weights."""
     colours = [[0, 0, 0], [255, 255, 255], [188, 188, 188], [255, 0, 0], [0, 255, 0], [0, 0, 255]]
     pixels = np.array([colours], np.uint8)
     radiance = radiance_of(tmp_path / "colour.png", pixels)

@@ -1,4 +1,4 @@
-"""Indexes of strangers: followed to images in their own folder, and nowhere else."""
+"""Tests that an untrusted index opens images in its own folder and nothing else."""
 
 import http.server
 import threading
@@ -26,7 +26,7 @@ def naming(name: str, relative: int = 1) -> str:
 
 
 def folder_of(tmp_path: Path) -> Path:
-    """A folder with a tile, beside which another one lies."""
+    """Make a folder with a tile and two files that are no images, and a tile outside of it."""
     folder = tmp_path / "product"
     folder.mkdir()
     images.write(folder / "tile.tif", np.ones((1, 9, 9), np.uint16), "GTiff")
@@ -36,7 +36,7 @@ def folder_of(tmp_path: Path) -> Path:
     return folder
 
 
-def test_what_an_index_names_is_found_once_each(tmp_path: Path) -> None:
+def test_each_file_that_an_index_names_is_listed_once(tmp_path: Path) -> None:
     folder = folder_of(tmp_path)
     (folder / "a.vrt").write_text(vrt(naming("sub.vrt") + naming("sub.vrt")))
     (folder / "sub.vrt").write_text(vrt(ONE))
@@ -100,7 +100,7 @@ def test_a_link_out_of_the_folder_is_refused(tmp_path: Path) -> None:
         index_files(folder / "a.vrt")
 
 
-def test_a_bomb_in_utf_16_is_seen(tmp_path: Path) -> None:
+def test_a_bomb_in_utf_16_is_refused(tmp_path: Path) -> None:
     folder = folder_of(tmp_path)
     (folder / "a.vrt").write_text(BOMB + vrt(ONE), encoding="utf-16")
     with pytest.raises(ImageError, match="document type"):
@@ -166,7 +166,7 @@ def test_a_dimap_that_leads_elsewhere_is_refused(
     assert words in str(caught.value)
 
 
-def test_a_bomb_beside_a_dimap_is_seen(tmp_path: Path) -> None:
+def test_a_bomb_in_a_file_of_a_dimap_is_refused(tmp_path: Path) -> None:
     index = images.write_dimap(tmp_path / "DIM.XML", images.digital_numbers())
     (tmp_path / "RPC.XML").write_text(BOMB + "<Dimap_Document>&b;</Dimap_Document>")
     with pytest.raises(ImageError, match="document type"):
@@ -174,7 +174,7 @@ def test_a_bomb_beside_a_dimap_is_seen(tmp_path: Path) -> None:
 
 
 class Silent(http.server.SimpleHTTPRequestHandler):
-    """Serves a folder and prints nothing."""
+    """A handler that serves a folder and prints nothing."""
 
     def log_message(self, *_: object) -> None:
         pass

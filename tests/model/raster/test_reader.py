@@ -1,4 +1,4 @@
-"""Rows are those of the whole image, whatever the file; sidecars count, damage is one sentence."""
+"""Tests of reading rows in each format, of sidecars, and of damaged files."""
 
 from pathlib import Path
 from typing import Any
@@ -83,7 +83,7 @@ def test_one_page_of_several_has_to_be_named(tmp_path: Path) -> None:
     refused(tmp_path / "pages.tif", ImageError, "one image, got 3.*GTIFF_DIR:1:")
 
 
-def test_tiles_never_written_hold_the_nodata_value(tmp_path: Path) -> None:
+def test_tiles_never_written_have_the_nodata_value(tmp_path: Path) -> None:
     tile = np.full((16, 16), 9, np.uint16)
     nodata = [(42113, "s", 0, "7", True)]
     shape: dict[str, Any] = {"shape": (16, 48), "dtype": "uint16", "tile": (16, 16)}
@@ -101,7 +101,7 @@ def refused(path: Path, error: type[BeersError], word: str) -> None:
         source.read(0, source.raster.height_px)
 
 
-def test_damage_is_one_sentence(tmp_path: Path) -> None:
+def test_damage_gets_one_sentence(tmp_path: Path) -> None:
     intact = tmp_path / "whole.tif"
     tifffile.imwrite(intact, pixels_of("uint16"), tile=(16, 16), compression="zlib")
     content = intact.read_bytes()
@@ -128,7 +128,7 @@ def test_statistics_of_the_raw_pixels_are_not_kept(tmp_path: Path) -> None:
 
 
 def test_sidecars_place_an_image(tmp_path: Path) -> None:
-    """Those of GDAL, a world file, and the polynomials beside a satellite tile."""
+    """The sidecars are GDAL's, a world file, and the polynomials next to a satellite tile."""
     pixels = pixels_of("uint16")
     for name in ("world", "gdal"):
         tifffile.imwrite(tmp_path / f"{name}.tif", pixels)

@@ -1,4 +1,4 @@
-"""What was written is read again, and a file that differs from it is an error."""
+"""Tests that written files are read back, and that a file with other pixels is an error."""
 
 import errno
 import os
@@ -20,7 +20,7 @@ from beers_deploy.profiles.errors import MachineError
 
 
 class Masked(ArrayPixels):
-    """Pixels that are missing in the first columns."""
+    """Pixels of which the first three columns are missing."""
 
     def read_mask(self, start: int, stop: int) -> np.ndarray:
         mask = super().read_mask(start, stop)
@@ -37,7 +37,7 @@ class Masked(ArrayPixels):
     st.integers(4, 300),
     st.sampled_from(["", "mask", "alpha"]),
 )
-def test_every_type_and_compression_is_what_was_written(
+def test_every_type_and_compression_is_read_back(
     tmp_path_factory: pytest.TempPathFactory,
     compression: Compression,
     kind: str,
@@ -53,7 +53,7 @@ def test_every_type_and_compression_is_what_was_written(
     write_raster(path, raster, Masked(pixels), compression)
     with warnings.catch_warnings(action="ignore"), rasterio.open(path) as file:
         np.testing.assert_array_equal(file.read()[:bands], pixels)
-        # GDAL itself takes alpha for a mask of one or three bands alone.
+        # GDAL treats alpha as a mask only if there are one or three bands.
         is_alpha = file.colorinterp[-1] is ColorInterp.alpha
         missing = (file.read(bands + 1) if is_alpha else file.dataset_mask()) == 0
     assert is_alpha == (mask_kind == "alpha")
@@ -95,7 +95,7 @@ def test_a_mask_that_differs_from_what_was_written_is_an_error(
 def test_a_file_that_cannot_grow_is_an_error_with_its_cause(
     limit_bytes: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """A limit on the size of files stands for a full disk."""
+    """A limit on the size of files simulates a full disk."""
     resource = pytest.importorskip("resource", reason="Windows has no such limit")
     dn = np.random.default_rng(0).integers(0, 4096, (300, 280)).astype(np.uint16)
     raster = Raster(1, 300, 280, dn.dtype)
@@ -110,7 +110,7 @@ def test_a_file_that_cannot_grow_is_an_error_with_its_cause(
             write_tiff(tmp_path / "b.tif", dn)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    # Nothing that libtiff prints stands next to the sentence.
+    # libtiff prints nothing in addition to the sentence.
     assert capfd.readouterr().err == ""
     assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
 

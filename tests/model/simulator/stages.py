@@ -1,4 +1,4 @@
-"""Sensors and scenes for the simulator's tests, and the signal before digitising."""
+"""Sensors and scenes for the simulator's tests, and the signal before digitization."""
 
 import math
 from collections.abc import Collection
@@ -23,14 +23,14 @@ TYPICAL = settled(typical_effects(), lambda constant: constant.middle)
 
 
 def plain_sensor(**effects: Effect) -> Instrument:
-    """The nominal degraded sensor with these effects."""
+    """Return the nominal degraded sensor with these effects."""
     return replace(NOMINAL, effects=effects)
 
 
 def before_digitising(
     radiance: np.ndarray, sensor: Instrument, ratio: int, draw: Draw, skip: Collection[str] = ()
 ) -> np.ndarray:
-    """What `simulate_planned` computes, up to the converter, so that no rounding hides a
+    """Compute the signal of `simulate_planned` before the converter, so that no rounding hides a
     difference.
     """
     if "mtf" in skip:
@@ -48,14 +48,14 @@ def before_digitising(
 def blurred(
     radiance: np.ndarray, ratio: int, blur: Blur, antialias_px: float = 0.0, smear_px: float = 0.0
 ) -> np.ndarray:
-    """A scene (H, W) behind a blur, at every target pixel, in W/m2/sr/um."""
+    """Blur a scene (H, W) and sample it at every target pixel, in W/m2/sr/um."""
     height, width = radiance.shape
     transfer = transfer_function(height, width, ratio, blur, antialias_px, smear_px)
     return sample(scene_spectrum(radiance), transfer, width, ratio)
 
 
 def pixel_means(radiance: np.ndarray, ratio: int) -> np.ndarray:
-    """The mean radiance of each whole target pixel."""
+    """Return the mean radiance of each whole target pixel."""
     height, width = (size // ratio for size in radiance.shape)
     return np.asarray(
         crop_divisible(radiance, ratio).reshape(height, ratio, width, ratio).mean((1, 3))
@@ -72,37 +72,35 @@ def _apply(
 
 
 def alone(effect: PixelEffect, image: np.ndarray, seed: int = 0) -> np.ndarray:
-    """One effect of the target grid on an image (..., H, W)."""
+    """Apply one effect of the target grid to an image (..., H, W)."""
     return effect.apply(image, plain_sensor(), partial(Draw(seed).generator, "alone"))
 
 
 def with_response(sensor: Instrument, response: Response) -> Instrument:
-    """The sensor with another blur."""
+    """Return the sensor with another blur."""
     across, along = response.at_nyquist
     return replace(sensor, mtf_nyquist=across, mtf_nyquist_along=along, response=response)
 
 
 def with_contrast(mtf_nyquist: float) -> Instrument:
-    """The nominal degraded sensor with another contrast at Nyquist."""
+    """Return the nominal degraded sensor with another contrast at Nyquist."""
     return replace(NOMINAL, mtf_nyquist=mtf_nyquist)
 
 
 def point_spread(samples: np.ndarray, per_px: float) -> PointSpread:
-    """These samples (H, W), as a profile keeps them."""
+    """Return samples (H, W) in the form that a profile stores."""
     return PointSpread(len(samples), samples.shape[1], per_px, packed(samples))
 
 
 def formula_table(across: float, along: float, steps: int = 5) -> MtfTable:
-    """The paper's formula at `steps` frequencies above 0, up to Nyquist."""
+    """Return a table of the paper's formula at `steps` frequencies above 0, up to Nyquist."""
     f = np.linspace(0, 0.5, steps + 1)
     columns = (mtf(f, 0.0, contrast).tolist() for contrast in (across, along))
     return MtfTable(tuple(f.tolist()), *map(tuple, columns))
 
 
 def formula_point(blur: Blur, per_px: int, side_px: int, odd: bool) -> PointSpread:
-    """The formula's own point-spread function, by inverse transform; of an even side the middle is
-    no sample's.
-    """
+    """Return the formula's point-spread function; with an even side no sample is in its middle."""
     side = per_px * side_px + odd
     f = np.fft.fftfreq(side, 1 / per_px)
     samples = np.fft.fftshift(np.fft.ifft2(mtf(f[None], f[:, None], blur)).real)
@@ -110,9 +108,7 @@ def formula_point(blur: Blur, per_px: int, side_px: int, odd: bool) -> PointSpre
 
 
 def gaussian_pixel(sigma_x: float, sigma_y: float, per_px: int, side: int) -> PointSpread:
-    """A Gaussian of other widths across and along, seen by a square pixel: side x (side + 4)
-    samples.
-    """
+    """Return a Gaussian of two widths integrated over square pixels: side x (side + 4) samples."""
 
     def line(size: int, sigma: float) -> np.ndarray:
         x = (np.arange(size) - (size - 1) / 2) / per_px
@@ -124,7 +120,7 @@ def gaussian_pixel(sigma_x: float, sigma_y: float, per_px: int, side: int) -> Po
 
 
 def lopsided_point(per_px: int = 4, rows: int = 37, columns: int = 48) -> PointSpread:
-    """Aslant, with a tail to one side and a faint dark ring: its response is complex."""
+    """Return a sheared point with a tail on one side and a dark ring: its response is complex."""
     y, x = (np.arange(size) - (size - 1) / 2 for size in (rows, columns))
     y = y[:, None] / per_px
     x = x / per_px
@@ -134,7 +130,7 @@ def lopsided_point(per_px: int = 4, rows: int = 37, columns: int = 48) -> PointS
 
 
 def blob(side: int, sigma: float) -> np.ndarray:
-    """A Gaussian centred in an even-sided square, between its four middle pixels."""
+    """Return a Gaussian centred in an even-sided square, between its four middle pixels."""
     x = np.arange(side) - (side - 1) / 2
     line = np.exp(-0.5 * (x / sigma) ** 2)
     return np.asarray(line[:, None] * line, np.float32)

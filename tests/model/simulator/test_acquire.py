@@ -44,7 +44,7 @@ def test_a_sine_keeps_the_contrast_that_the_mtf_says(
 
 
 def steepest_fall(ratio: int, mtf_nyquist: float) -> float:
-    """The largest fall between neighbours, in DN, across a step upwards of 1500 DN."""
+    """Return the largest fall between neighbours, in DN, across an upward step of 1500 DN."""
     side = 96 * ratio
     step = np.full((side, side), 50.0, np.float32)
     step[:, side // 2 :] = 200.0
@@ -71,9 +71,7 @@ def test_the_two_noises_of_a_pair_are_independent() -> None:
 
 
 def test_the_margin_keeps_the_wrapped_border_out() -> None:
-    """A bright strip at the left edge wraps into the right one; within the margin it must have
-    faded.
-    """
+    """A bright strip at the left edge wraps to the right edge, where the margin must remove it."""
     dark, strip = (np.full((600, 600), 50.0, np.float32) for _ in range(2))
     strip[:, :5] = 400.0
 
@@ -102,9 +100,7 @@ def test_a_padded_acquisition_covers_the_whole_scene(height: int, width: int) ->
 
 
 def test_padding_shifts_nothing() -> None:
-    """Where a margin of real scene surrounds it, an acquisition is the same to what the mirror
-    brings in.
-    """
+    """Inside a margin of real scene, padded and cropped acquisitions differ by the mirror alone."""
     radiance = procedural_scene(600, 600, np.random.default_rng(3)).radiance
     padded = acquire_padded(radiance, QUIET, 3, Draw(0), "degraded")
     cropped = acquire(prepare_scene(radiance, 3), QUIET, Draw(0))

@@ -53,9 +53,7 @@ def scene(height: int = 340, width: int = 390, seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize("name", TABLES)
 def test_skipping_equals_applying_at_neutral_parameters_bit_for_bit(name: str) -> None:
-    """Whether the plan leaves the effect out or skips nothing: the operator itself must change no
-    bit.
-    """
+    """The operator itself must change no bit, also with a plan that skips nothing."""
     radiance = scene(171, 195)
     draw = Draw(3)
     neutral = stages.plain_sensor(**{name: NEUTRAL[name]})
@@ -99,7 +97,7 @@ def test_affine_effects_have_their_values(effect: PixelEffect, expected: list[fl
     assert stages.alone(effect, image)[0].tolist() == expected
 
 
-def test_what_spills_stays_in_its_column() -> None:
+def test_spilled_charge_stays_in_its_column() -> None:
     image = np.full((61, 21), 20.0, np.float32)
     image[30, 10] = 520.0
     flooded = stages.alone(FullWell(120.0, 0.4, 3.0), image)
@@ -127,7 +125,7 @@ def test_an_infeasible_budget_is_refused_with_its_numbers() -> None:
 
 @pytest.mark.parametrize("name", ["dsnu", "striping", "offset"])
 def test_the_noise_is_the_same_whether_a_pattern_is_applied_or_not(name: str) -> None:
-    """What is added in DN is then all that differs, and it is the same in every row."""
+    """Only the pattern added in DN differs, and it is the same in every row."""
     radiance = scene(93, 111)
     sensor = stages.plain_sensor(dsnu=Dsnu(3.0), striping=Striping(2.0), offset=Offset(64.0))
     full = stages.before_digitising(radiance, sensor, 3, Draw(5))
@@ -192,7 +190,7 @@ def test_clipping_comes_before_the_cast() -> None:
     assert to_uint16(np.array([-1.0, 70000.0], np.float32)).tolist() == [0, 65535]
 
 
-def test_whole_numbers_survive_a_round_trip() -> None:
+def test_integers_survive_a_round_trip() -> None:
     dn = np.arange(4096, dtype=np.float32)
     np.testing.assert_array_equal(digitise(to_radiance(dn, SENSOR) * GAIN, SENSOR), dn, strict=True)
 

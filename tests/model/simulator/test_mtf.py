@@ -55,7 +55,7 @@ def test_two_equal_axes_are_one_to_the_last_bit(
 def test_the_formula_of_two_axes_meets_that_of_one(
     mtf_nyquist: float, height: int, width: int
 ) -> None:
-    """Axes that differ in the last digits take the other branch: no step lies between the two."""
+    """Axes that differ in the last digits use the other branch, which must give the same MTF."""
     fx, fy = grid(height, width)
     near = mtf(fx, fy, (mtf_nyquist, mtf_nyquist * (1 + 1e-12)))
     np.testing.assert_allclose(near, mtf(fx, fy, mtf_nyquist), rtol=1e-10, atol=1e-14)

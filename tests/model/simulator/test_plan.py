@@ -1,4 +1,4 @@
-"""The plan's promise: no skipped effect would have changed a pixel by more than its bound."""
+"""Tests that no skipped effect would have changed a pixel by more than its bound."""
 
 import json
 import os
@@ -38,10 +38,10 @@ from beers_deploy.profiles.response import MtfTable
 from tests.model.simulator import stages
 
 EXAMPLES = int(os.environ.get("BEERS_PLAN_EXAMPLES", "60"))
-"""Thousands by hand: BEERS_PLAN_EXAMPLES=5000 pytest tests/model/simulator/test_plan.py."""
+"""Run more by hand: BEERS_PLAN_EXAMPLES=5000 pytest tests/model/simulator/test_plan.py."""
 
 ROUNDING_DN = 0.02
-"""float32 arithmetic at a few thousand DN."""
+"""The rounding of float32 arithmetic at a few thousand DN."""
 
 ALL_APPLIED = Plan((), TOLERANCE_DN)
 """A plan that skips nothing."""
@@ -112,7 +112,7 @@ sensors = st.one_of(
 
 
 def change(radiance: np.ndarray, sensor: Instrument, ratio: int, name: str, seed: int) -> float:
-    """Largest change of any pixel before digitising when one effect is left out."""
+    """Return the largest change of a pixel before digitization if one effect is left out."""
     skip = {name, "smear", "antialias"} if name == "mtf" else {name}
     radiance = crop_divisible(radiance, ratio)
     exact = stages.before_digitising(radiance, sensor, ratio, Draw(seed))
@@ -165,7 +165,7 @@ STRONG: dict[str, Effect] = {
     "name", ["mtf", "noise", *(name for name in TABLES if name != "antialias")]
 )
 def test_a_quarter_of_any_bound_would_be_caught(name: str) -> None:
-    """The bounds are not kept only because they are loose."""
+    """The bounds are not loose: each is less than four times the largest change."""
     radiance = np.zeros((90, 75), np.float32)
     radiance[10, :] = radiance[20:70, 10:50] = 200.0
     sensor = stages.plain_sensor(**{name: STRONG[name]} if name in TABLES else {})
@@ -197,14 +197,14 @@ WELL = stages.plain_sensor(full_well=FullWell(300.0, 0.3, 4.0))
         (SCENE, replace(stages.plain_sensor(), alpha=0.0, beta=0.0), ("noise",), "neutral"),
     ],
 )
-def test_what_a_scene_shows_decides(
+def test_the_plan_depends_on_what_a_scene_can_show(
     radiance: np.ndarray, sensor: Instrument, names: tuple[str, ...], choice: str
 ) -> None:
     choices = {d.effect: d.choice for d in make_plan(sensor, scene_stats(radiance, 2)).decisions}
     assert {choices[name] for name in names} == {choice}
 
 
-def test_a_plan_is_data() -> None:
+def test_a_plan_is_stored_as_json() -> None:
     plan = make_plan(stages.plain_sensor(**stages.TYPICAL), scene_stats(SCENE, 2))
     assert json.loads(json.dumps(plan.to_json()))["tolerance_dn"] == TOLERANCE_DN
     assert [decision.effect for decision in plan.decisions] == [*ORDER]

@@ -1,6 +1,4 @@
-"""A tabulated MTF and a point-spread function blur as they say: contrast, place and radiance, on
-both axes.
-"""
+"""Tests of blurs by MTF tables and point-spread functions: contrast, position and radiance."""
 
 import math
 from dataclasses import replace
@@ -45,7 +43,7 @@ def test_a_slanted_edge_shows_both_contrasts(name: str) -> None:
 
 
 def lean(image: np.ndarray) -> float:
-    """Mean product of the offsets down and right from the centroid, in pixels squared."""
+    """Return the mean product of the offsets down and right from the centroid, in square pixels."""
     down, right = (
         np.arange(n) - (n - 1) / 2 - middle
         for n, middle in zip(image.shape, centroid(image), strict=True)
@@ -53,8 +51,8 @@ def lean(image: np.ndarray) -> float:
     return float(down @ image @ right / image.sum())
 
 
-def test_a_point_aslant_is_not_straightened() -> None:
-    """Second moments of what is convolved add up, and a blob has none of both axes."""
+def test_a_sheared_point_stays_sheared() -> None:
+    """The second moments of convolved functions add up, and the mixed moment of a blob is 0."""
     point = stages.lopsided_point()
     image = stages.blurred(stages.blob(192, 12.0), 4, point)
     expected = lean(unpacked(point)) / point.samples_per_px**2
@@ -83,10 +81,10 @@ def test_a_table_of_the_formula_is_the_formula(contrasts: tuple[float, float], s
 @pytest.mark.parametrize("side", [64, 75])
 @pytest.mark.parametrize("odd", [True, False])
 def test_a_point_of_the_formula_gives_the_formulas_images(odd: bool, side: int) -> None:
-    """Nearly exactly where the scene repeats as the point's window does, 64 pixels, and 3000 DN of
-    contrast or less.
+    """At 3000 DN of contrast they agree best if the scene has the size of the point's window, 64
+    pixels.
 
-    Elsewhere the tail beyond the window is missing; an even side has one row too many at one end,
+    Otherwise the tail beyond the window is missing. An even side has one row too many at one end,
     which moves the centroid by thousandths of a pixel.
     """
     ratio = 4
@@ -101,7 +99,7 @@ def test_a_point_of_the_formula_gives_the_formulas_images(odd: bool, side: int) 
 
 
 @pytest.mark.parametrize("name", BLURS)
-def test_smear_comes_on_top_and_the_filter_is_part_of_it(name: str) -> None:
+def test_smear_multiplies_a_response_which_includes_the_antialias_filter(name: str) -> None:
     blur, _ = BLURS[name]
     transfer = transfer_function(30, 36, 3, blur, 0.0, 1.5)
     plain = transfer_function(30, 36, 3, blur)

@@ -1,6 +1,4 @@
-"""One fused pass computes what the effects would, one after the other, at full resolution; nothing
-is shifted.
-"""
+"""Tests that one fused pass equals the effects one by one at full resolution, without a shift."""
 
 import logging
 import math
@@ -26,9 +24,7 @@ def scene(height: int, width: int, seed: int = 0) -> np.ndarray:
 def one_after_the_other(
     radiance: np.ndarray, ratio: int, mtf_nyquist: float, sigma: float, smear: float
 ) -> np.ndarray:
-    """Blur, then smear, then shift, each with a transform of its own in float64; then pick every
-    r-th pixel.
-    """
+    """Blur, smear and shift with a float64 transform each; then take every r-th pixel."""
     height, width = radiance.shape
     fy = np.fft.fftfreq(height, 1 / ratio)[:, None]
     fx = np.fft.rfftfreq(width, 1 / ratio)[None]
@@ -105,7 +101,7 @@ def test_a_stack_of_scenes_is_sampled_one_by_one() -> None:
 
 
 def wave(height: int, width: int, cycles: tuple[int, int]) -> np.ndarray:
-    """A plane wave over the whole scene, sampled at pixel centres."""
+    """Return a plane wave over the whole scene, sampled at pixel centres."""
     y, x = ((np.arange(n) + 0.5) / n for n in (height, width))
     phase = 2 * math.pi * (cycles[0] * y[:, None] + cycles[1] * x) + 0.7
     return (100 + 30 * np.cos(phase)).astype(np.float32)
@@ -120,7 +116,7 @@ def test_a_wave_that_both_grids_hold_is_the_same_wave(
     np.testing.assert_allclose(result, wave(height, width, cycles), rtol=0, atol=1e-3, strict=True)
 
 
-def test_what_the_new_grid_cannot_hold_is_cut_not_aliased() -> None:
+def test_frequencies_beyond_the_new_grid_are_cut_not_aliased() -> None:
     result = resample(wave(60, 84, (0, 30)), 40, 40)
     np.testing.assert_allclose(
         result, np.full((40, 40), 100.0, np.float32), rtol=0, atol=1e-3, strict=True
