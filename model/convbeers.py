@@ -137,7 +137,7 @@ class _InSteps(Function):
 
 @dataclass(frozen=True)
 class Rounding:
-    """How an INT8 file rounds the maps of a network behind a bank.
+    """The quantisation steps to which an INT8 file rounds the maps of a network behind a bank.
 
     Attributes:
         stream: the quantisation step of the F maps between head and tail, (F, 1, 1), for a bank

@@ -21,11 +21,11 @@ CURVES = "convbeers-s-curves"
 """The shipped network that was trained on many curves of the MTF."""
 
 EXPECTED = {"cut": "the formula's curve has", "fitted": "networks were trained on"}
-"""What a curve is compared with, by the kind of banks."""
+"""The reference that a warning names for a curve, by the kind of banks."""
 
 MARGIN = 0.05
-"""How far a curve may lie outside the training curves, as a share. Beyond it networks lose 0.1 dB
-and more (measured).
+"""The largest distance of a curve from the training curves, as a share. Beyond it networks lose
+0.1 dB and more (measured).
 """
 
 

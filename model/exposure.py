@@ -71,7 +71,7 @@ the ground around them is restored at another exposure than the rest (measured).
 """
 
 NOISE_BEYOND = 1.25
-"""How far the noise may exceed that of the training range.
+"""The largest ratio of the noise to that of the training range.
 
 At 1.25 times the networks still gain 0.1 to 0.8 dB, at 1.4 times they lose 0.2 dB in some scenes,
 at twice 4 dB (measured).
@@ -86,21 +86,21 @@ than 0.02 dB (measured on training places).
 """
 
 INTEGER_NOISE = 2.5
-"""How far the noise of the multiplied image may exceed that of the training range.
+"""The largest ratio of the multiplied image's noise to that of the training range.
 
 Up to 2.4 times, `convbeers-s` gained 0.03 to 0.45 dB at a twentieth of the radiance. At 4 times, it
 lost up to 0.4 dB behind some sensors (measured on training places).
 """
 
 FINEST = 4
-"""The largest `Exposure.finer`. The features of a network that tell brightness grow with it as
-well, and at 8 they are clipped: behind the noisiest sensor the result then lost 2 dB (measured on
+"""The largest `Exposure.finer`. The features of a network that encode brightness grow with it as
+well, and at 8 they are clipped: for the noisiest sensor the result then lost 2 dB (measured on
 training places).
 """
 
 GAIN_NOISE = 1.1
-"""How far the noise of the sensor that an integer network is conditioned on may exceed that of the
-training range.
+"""The largest ratio of the noise that an integer network is conditioned on to that of the training
+range.
 
 It may be less than NOISE_BEYOND, because finer steps replace the rest of the factor: at 1.15 times
 a network lost 0.1 dB to one of half the gain (measured on training places).

@@ -40,8 +40,8 @@ CONTEXT_PX = 1
 
 MIDDLE_MTF = 0.07
 MIDDLE_NOISE = 0.0022
-"""Where m and n are 0: MTF at Nyquist, and the noise at 1/4 of full scale over full scale. Both are
-those of a sensor in the middle of the trained range, so that exponents say what they mean alone.
+"""The values at which m and n are 0: MTF at Nyquist, and the noise at 1/4 of full scale over full
+scale. Both are those of a sensor in the middle of the trained range.
 """
 
 LEAST_DETAIL = 0.05
@@ -99,7 +99,7 @@ class Exponents:
 
 @dataclass(frozen=True)
 class Conditions:
-    """What the half-widths of all pixels of one sensor depend on.
+    """The properties of a sensor on which the half-widths of all its pixels depend.
 
     Attributes:
         blur: m, twice the mean of ln(MTF / MTF of the middle sensor) over the frequencies up to

@@ -47,7 +47,7 @@ class Step:
 
 
 Progress = bool | Callable[[Step], None] | None
-"""How a caller wants to see progress: a function that is called; False for not at all; None or True
+"""The form in which a caller gets progress: a function that is called; False for none; None or True
 for a bar or plain lines.
 """
 

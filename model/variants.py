@@ -13,8 +13,8 @@ from typing import Literal
 from beers_deploy.profiles.errors import OptionError
 
 Kernels = Literal["cut", "fitted"]
-"""How the filters in front of a network are reduced to kernels of 7 x 7: cut from the whole filter,
-or fitted.
+"""The way in which the filters in front of a network become kernels of 7 x 7: cut from the whole
+filter, or fitted to it.
 
 Networks behind fitted kernels were trained on many curves of the MTF (`model.curves`).
 """

@@ -13,7 +13,7 @@ from beers_deploy.profiles.errors import printable
 from beers_deploy.profiles.validation import CONFIG
 
 Status = Literal["published", "inferred", "measured", "assumed", "stated"]
-"""Where a value comes from.
+"""The origin of a value.
 
 "published": in a document. "measured": on the instrument. "inferred": computed from published or
 measured values. "assumed": chosen by this project. "stated": given by the user.

@@ -35,7 +35,9 @@ Frequencies = NDArray[np.floating]
 
 
 READING = 0.005
-"""How far a table may exceed the MTF of the square detector: half of the last of two decimals."""
+"""The excess of a table over the MTF of the square detector that is allowed for rounding: half of
+the last of two decimals.
+"""
 MOST_FREQUENCIES = 1000
 LEAST_STEP = 1e-4
 KEPT_SIDE = 1024

@@ -20,7 +20,7 @@ def part_folder(out: Path) -> Path:
 
 NAME = "lock"
 GRACE_S = 0.2
-"""How long to wait for a run that is just ending. It removes the lock file, and the waiting run
+"""The time to wait for a run that is just ending. It removes the lock file, and the waiting run
 creates a new one.
 """
 ENOTSUPP = 524

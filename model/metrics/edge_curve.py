@@ -46,16 +46,16 @@ PASSES = 2
 ROUNDS = 5
 
 TIERS = ((0.012, 3, 0.02), (0.03, 8, 0.08), (0.06, 10, 0.08))
-"""For edges found by search: the largest texture over step, the number of such edges that is
+"""Limits for edges found by search: the largest texture over step, the number of such edges that is
 needed, and the least relative standard error of their curve. Among 1200 steep places of
-photographs, those of the first tier were all within 0.5 px of a step's softness; of the second, one
-in three was not (measured).
+photographs, all of the first tier were within 0.5 px of a step's softness, and two thirds of the
+second (measured).
 """
 MAX_ERROR_PX = 0.6
 """The largest standard error of the softness of an edge found by search."""
 NATURAL_PX = 0.3
-"""How much softer than a step the sharpest edges of a scene may be, and how much sharper thin
-objects next to them make them appear; it widens the interval.
+"""The error by which the interval is widened: the sharpest edges of a scene may be softer than a
+step, and thin objects next to them make them appear sharper.
 """
 MOST_FITTED = 600
 """If there are more edges, every n-th one is fitted, such that at least this number is."""

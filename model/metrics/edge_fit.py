@@ -157,7 +157,7 @@ def fit_blurs(regions: np.ndarray, noise: Noise, limits: Limits) -> list[Fit]:
         remaining = [k for k in refused if k not in steeper]
         fits = fit_shape(pixels[remaining], limits, shape)
         steeper |= {k for k, fit in zip(remaining, fits, strict=True) if fit is not None}
-    # What a steeper curve fits is an edge. The profile's own curve is fitted to it all the same.
+    # A square that a steeper curve fits is an edge, but its blur is that of the profile's curve.
     steep = sorted(steeper)
     for k, fit in zip(steep, fit_shape(pixels[steep], ANY), strict=True):
         results[k] = fit

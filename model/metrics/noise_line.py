@@ -141,7 +141,7 @@ def fit_noise(blocks: Blocks, incomplete: bool = False) -> NoiseModel | Refusal:
     if blocks.mean.size < LEAST:
         return Refusal(f"{blocks.mean.size} blocks of 16 x 16 unclipped pixels, {LEAST} are needed")
     quietest = float(np.percentile(blocks.fine, QUIET_PERCENT))
-    # What was restored or resampled has less noise than a detector, at the finest detail.
+    # A restored or resampled image has less noise at the finest detail than a detector.
     if quietest < ROUNDING + LEAST_NOISE:
         return Refusal(
             f"the finest detail has a variance of {quietest:.2g} DN^2, but rounding alone adds "

@@ -166,7 +166,7 @@ def fit_edge(
         scale = max(MAD * float(np.median(np.abs(rest))), 1e-9)
         # Cars, branches and drains lie next to edges, so pixels with large residuals count less.
         huber = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(rest), 1e-9))
-        # What the noise does not explain is texture, which lowers the weight of the edge.
+        # A residual beyond the noise is texture, which lowers the weight of the edge.
         texture = max(float(np.average(rest**2, weights=huber)) - float(near.variance.mean()), 0.0)
         pixel_weights = np.sqrt(huber / (near.variance + texture))
         rise = plane @ (levels[3:] - levels[:3])

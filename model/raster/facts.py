@@ -26,7 +26,7 @@ OFFSET_DN = 40
 RGB_BANDS = ("red", "green", "blue")
 
 MaskKind = Literal["", "mask", "alpha"]
-"""What marks missing pixels in addition to NaN and the nodata value."""
+"""The kind of mask that marks missing pixels, in addition to NaN and the nodata value."""
 
 ControlPoint = tuple[float, float, float, float, float]
 """A ground control point: row and column in pixels, then x, y and z in the reference system."""
