@@ -114,7 +114,7 @@ def test_shifts_cover_every_operator_and_fit_their_bits(core: IntCore) -> None:
 
 def test_numbers_that_the_board_could_not_store_are_refused(quantized: Quantized) -> None:
     op = quantized.core.convolutions[0]
-    too_large = replace(op, bias=np.full(len(op.bias), 100_001), bias_frac_bits=op.bias_frac_bits)
+    too_large = replace(op, bias=np.full(len(op.bias), 100_001))
     far = replace(
         op, weight_frac_bits=op.weight_frac_bits + 40, bias_frac_bits=op.bias_frac_bits + 40
     )

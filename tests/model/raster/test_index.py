@@ -76,15 +76,16 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
+@pytest.mark.parametrize("name", ["a.vrt", "b.vrt"], ids=["directly", "through another"])
 def test_an_index_that_leads_elsewhere_is_refused(
-    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = folder_of(tmp_path)
     monkeypatch.chdir(tmp_path)
     text, words = REFUSED[case]
     (folder / "a.vrt").write_text(text)
     (folder / "b.vrt").write_text(vrt(naming("a.vrt")))
-    with pytest.raises(ImageError) as caught, open_raster(folder / "a.vrt"):
+    with pytest.raises(ImageError) as caught, open_raster(folder / name):
         pass
     assert words in str(caught.value)
 
