@@ -1,4 +1,4 @@
-"""What the tests of the traditional pipeline share."""
+"""Fixtures of the tests of the traditional pipeline."""
 
 import pytest
 import skimage.data
@@ -8,5 +8,5 @@ from torch import Tensor
 
 @pytest.fixture(scope="session")
 def camera() -> Tensor:
-    """The photograph of a man behind a camera, (512, 512) float32 grey levels."""
+    """Return the photograph of a man behind a camera, (512, 512) float32 grey levels."""
     return torch.from_numpy(skimage.data.camera()).float()

@@ -1,4 +1,4 @@
-"""scikit-image's restorations: better than the input, behind the pipeline, sound on any shape."""
+"""Tests that scikit-image's restorations beat their input, not the pipeline, on any shape."""
 
 import pytest
 import torch
@@ -7,19 +7,21 @@ from torch import Tensor
 from beers_deploy.model.traditional.baselines import BASELINES
 from beers_deploy.model.traditional.pipeline import TraditionalPipeline
 from tests.model.simulator.stages import NOMINAL, REFERENCE
-from tests.model.traditional.test_pipeline import Seen, psnr_db, restored_db, seen_by
+from tests.model.traditional.test_pipeline import AcquiredPair, acquired_pair, psnr_db, restored_db
 
 PIPELINE = TraditionalPipeline(NOMINAL, REFERENCE)
 
 
 @pytest.fixture(scope="module")
-def pair(camera: Tensor) -> Seen:
-    return seen_by(camera, NOMINAL, REFERENCE)
+def pair(camera: Tensor) -> AcquiredPair:
+    return acquired_pair(camera, NOMINAL, REFERENCE)
 
 
 @pytest.mark.parametrize("name", BASELINES)
-def test_a_baseline_gains_decibels_and_stays_behind_the_pipeline(name: str, pair: Seen) -> None:
-    """A baseline that is misled about gain, shift or target MTF would flatter the pipeline."""
+def test_a_baseline_gains_decibels_and_stays_behind_the_pipeline(
+    name: str, pair: AcquiredPair
+) -> None:
+    """A baseline with a wrong gain, shift or target MTF would flatter the pipeline."""
     restored = BASELINES[name](pair.degraded, PIPELINE)
     before, after = (psnr_db(image, pair.reference) for image in (pair.degraded, restored))
     assert before + 3 < after < restored_db(pair, PIPELINE)
@@ -28,7 +30,9 @@ def test_a_baseline_gains_decibels_and_stays_behind_the_pipeline(name: str, pair
 
 @pytest.mark.parametrize("name", BASELINES)
 @pytest.mark.parametrize("shape", [(37, 53), (14, 21)])
-def test_any_shape_comes_back_within_range(name: str, shape: tuple[int, int], pair: Seen) -> None:
+def test_any_shape_is_restored_within_range(
+    name: str, shape: tuple[int, int], pair: AcquiredPair
+) -> None:
     restored = BASELINES[name](pair.degraded[: shape[0], : shape[1]], PIPELINE)
     assert restored.shape == shape
     assert bool(torch.isfinite(restored).all())

@@ -1,6 +1,4 @@
-"""MTF compensation: gain 1 at DC, the target MTF without regularisation, finite
-whatever the blur.
-"""
+"""Tests of MTF compensation: gain 1 at DC, the target MTF without regularization, no infinity."""
 
 import numpy as np
 import pytest
@@ -52,10 +50,8 @@ def test_gain_is_one_at_dc_and_finite_everywhere(
     ],
     ids=["formula", "smear", "anti-alias filter", "point spread"],
 )
-def test_without_regularisation_a_blur_is_undone_whole(degraded: Instrument) -> None:
-    """What a point spread shifted and turned lies straight again: gain times blur is the target,
-    phase and all.
-    """
+def test_without_regularisation_a_blur_is_undone_completely(degraded: Instrument) -> None:
+    """Gain times blur is the target MTF, so the phase of a point-spread function is undone too."""
     fx = np.fft.rfftfreq(34)[None]
     fy = np.fft.fftfreq(26)[:, None]
     gain = compensation_gain(26, 34, degraded, REFERENCE, epsilon=0)
@@ -71,9 +67,7 @@ def test_regularisation_holds_the_noise_of_a_weak_mtf_down() -> None:
 @pytest.mark.parametrize("mtf_from", [0.07, 1.001e-4])
 @pytest.mark.parametrize("shape", [(128, 128), (61, 75), (400, 31), (1, 3)])
 def test_the_mean_is_preserved(shape: tuple[int, int], mtf_from: float) -> None:
-    """A symmetric filter on a mirrored image: the mean of the crop is that of a period, whatever
-    the size.
-    """
+    """With a symmetric filter on a mirrored image, the crop has the mean of a whole period."""
     image = texture(*shape)
     restored = compensate(image, mtf_from, 0.25, EPSILON)
     assert restored.shape == shape
@@ -81,7 +75,7 @@ def test_the_mean_is_preserved(shape: tuple[int, int], mtf_from: float) -> None:
 
 
 def test_a_regulariser_that_reaches_dc_would_not_preserve_it() -> None:
-    """T H / (H^2 + epsilon), the usual form: 1 % of the light is gone, and PSNR with it."""
+    """The usual form, T H / (H^2 + epsilon), loses 1 % of the light here, which limits the PSNR."""
     blur, target = (transfer_function(128, 128, 1, m) for m in (0.07, 0.25))
     plain = float((target * blur / (blur**2 + 1e-2))[0, 0])
     assert plain == pytest.approx(1 / 1.01)
@@ -131,7 +125,7 @@ def test_missing_pixels_reach_no_further_than_the_filter() -> None:
     assert float(nearby) < 0.7 * float((zeros - without_hole)[40:44, :30].abs().mean())
 
 
-def test_it_carries_one_blur_into_the_other() -> None:
+def test_it_converts_one_blur_into_the_other() -> None:
     yy, xx = np.mgrid[:261, :275]
     scene = np.asarray(2000 + 1000 * np.sin(0.9 * xx + 0.4 * yy) * np.cos(0.07 * xx), np.float32)
     before_and_after = (stages.blurred(scene, 1, m) for m in (0.07, 0.25))
@@ -145,6 +139,6 @@ def test_it_carries_one_blur_into_the_other() -> None:
 
 
 @pytest.mark.parametrize("epsilon", [-1e-3, float("nan"), float("inf")])
-def test_a_senseless_epsilon_is_refused(epsilon: float) -> None:
+def test_an_invalid_epsilon_is_refused(epsilon: float) -> None:
     with pytest.raises(OptionError, match="epsilon"):
         compensation_gain(8, 8, with_contrast(0.07), REFERENCE, epsilon)

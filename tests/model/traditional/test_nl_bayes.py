@@ -1,4 +1,4 @@
-"""NL-Bayes: the published quality, sound answers to hard images, and no trace of the tiles."""
+"""Tests of NL-Bayes: the published quality, valid results for hard images, no trace of tiles."""
 
 from itertools import pairwise
 
@@ -55,10 +55,10 @@ def hard_images() -> dict[str, Tensor]:
 
 @pytest.mark.parametrize(("sigma", "floor_db"), [(10.0, 34.85), (20.0, 31.0)])
 def test_it_reaches_the_published_quality(camera: Tensor, sigma: float, floor_db: float) -> None:
-    """Measured 34.96 and 31.14 dB on this crop; 0.1 dB is left for other processors' rounding.
+    """This crop gives 34.96 and 31.14 dB (measured); 0.1 dB is left for other processors' rounding.
 
-    On the whole 512 x 512 photograph the same code gives 34.28 and 30.74 dB, the authors' own
-    program 34.26 and 30.77 dB: a fault of the method would show here as half a decibel or more.
+    On the whole 512 x 512 photograph the same code gives 34.28 and 30.74 dB, and the authors' own
+    program 34.26 and 30.77 dB. A fault of the method would cost half a decibel or more here.
     """
     clean = camera[96:288, 160:352]
     assert psnr_db(nl_bayes(with_noise(clean, sigma), Noise(sigma)), clean) > floor_db
@@ -118,8 +118,8 @@ def test_strips_change_no_bit(height: int, cuts: list[int], camera: Tensor) -> N
     )
 
 
-def test_results_come_before_the_image_has_ended(camera: Tensor) -> None:
-    """Memory is bounded: the first rows leave when a fraction of the image has been read."""
+def test_results_are_returned_before_the_image_ends(camera: Tensor) -> None:
+    """Memory is bounded: the first rows are returned after a fraction of the image is read."""
     strips = iter(torch.split(with_noise(camera[:, 160:181], SIGMA), 16))
     first = next(nl_bayes_strips(strips, 512, WHITE, QUALITIES["standard"]))
     assert len(first) > 0
@@ -133,8 +133,8 @@ def with_hole(image: Tensor, value: float = torch.nan) -> Tensor:
     return holed
 
 
-def test_missing_pixels_stay_missing_and_nobody_sees_them(camera: Tensor) -> None:
-    """Beside a hole the result is what it would be, a little worse for want of company."""
+def test_missing_pixels_stay_missing_and_affect_no_others(camera: Tensor) -> None:
+    """Next to a hole the PSNR is at most 1 dB lower, since there are fewer patches."""
     clean = camera[96:169, 160:235]
     noisy = with_noise(clean, SIGMA)
     restored = nl_bayes(with_hole(noisy), WHITE)
@@ -143,7 +143,7 @@ def test_missing_pixels_stay_missing_and_nobody_sees_them(camera: Tensor) -> Non
     assert torch.equal(torch.isfinite(restored), valid)
     ring = valid & (torch.nn.functional.max_pool2d((~valid)[None, None].float(), 9, 1, 4)[0, 0] > 0)
     assert psnr_db(restored[ring], clean[ring]) > psnr_db(without_hole[ring], clean[ring]) - 1
-    # The control: a hole filled with a value spoils its surroundings.
+    # Control: a hole filled with a value degrades its surroundings.
     far = nl_bayes(with_hole(noisy, 4095.0), WHITE)
     assert psnr_db(far[ring], clean[ring]) < psnr_db(restored[ring], clean[ring])
 
@@ -172,7 +172,7 @@ def test_coloured_noise_is_described_by_its_filter() -> None:
     )
 
 
-def test_knowing_the_colour_of_the_noise_pays(camera: Tensor) -> None:
+def test_a_model_of_the_noise_colour_improves_the_result(camera: Tensor) -> None:
     clean = camera[96:225, 160:289]
     noise = high_pass(with_noise(torch.zeros(129, 129), 3.0)).float()
     coloured = coloured_by(SHARPENER, 3.0)
@@ -181,7 +181,7 @@ def test_knowing_the_colour_of_the_noise_pays(camera: Tensor) -> None:
 
 
 def test_the_estimate_of_pass_2_is_the_posterior_mean() -> None:
-    """P_mean + C (C + beta sigma^2 I)^-1 (P - P_mean), over the taken patches alone."""
+    """It is P_mean + C (C + beta sigma^2 I)^-1 (P - P_mean) over the selected patches alone."""
     generator = np.random.default_rng(6)
     guide = torch.from_numpy(generator.normal(0, 40, (1, 60, 25)))
     noisy = guide + SIGMA * torch.from_numpy(generator.standard_normal((1, 60, 25)))
@@ -211,7 +211,7 @@ def test_a_flat_group_becomes_its_mean() -> None:
 
 
 def test_the_published_settings() -> None:
-    """At the sigma of the chain: 45 of 23 x 23 patches, then at least 15 of 7 x 7."""
+    """For the pipeline's sigma they are 45 of 23 x 23 patches, then at least 15 of 7 x 7."""
     first = first_pass(SIGMA)
     second = second_pass(SIGMA, QUALITIES["standard"])
     assert (first.side_px, first.similar, first.window_px, first.excess) == (5, 45, 23, 1.1)

@@ -1,6 +1,4 @@
-"""The whole pipeline on a simulated pair: what it gains, and what it loses when
-told the wrong sensor.
-"""
+"""Tests of the whole pipeline on a simulated pair: its gain, and its loss with a wrong sensor."""
 
 from dataclasses import replace
 from typing import NamedTuple, get_args
@@ -35,35 +33,38 @@ ORDERS: tuple[Order, ...] = get_args(Order)
 NOISE_FREE = replace(REFERENCE, alpha=0.0, beta=0.0)
 
 
-class Seen(NamedTuple):
-    """Two acquisitions (H, W), as the pipeline takes them."""
+class AcquiredPair(NamedTuple):
+    """Two acquisitions (H, W) in digital numbers, as the pipeline accepts them."""
 
     degraded: Tensor
     reference: Tensor
 
 
-def seen_by(camera: Tensor, sensor: Instrument, reference: Instrument = NOISE_FREE) -> Seen:
-    """A photograph of up to 200 W/m2/sr/um, 139 x 145 pixels within the margin, its reference
-    without noise.
+def acquired_pair(
+    camera: Tensor, sensor: Instrument, reference: Instrument = NOISE_FREE
+) -> AcquiredPair:
+    """Simulate a photograph of up to 200 W/m2/sr/um: 139 x 145 pixels within the margin.
+
+    By default the reference has no noise.
     """
     pair = simulate_pair(
         camera[64:267, 128:337].numpy() * (200 / 255), sensor, reference, 1, Draw(seed=1)
     )
-    return Seen(torch.from_numpy(pair.degraded), torch.from_numpy(pair.reference))
+    return AcquiredPair(torch.from_numpy(pair.degraded), torch.from_numpy(pair.reference))
 
 
 @pytest.fixture(scope="module")
-def pair(camera: Tensor) -> Seen:
-    return seen_by(camera, NOMINAL)
+def pair(camera: Tensor) -> AcquiredPair:
+    return acquired_pair(camera, NOMINAL)
 
 
 def psnr_db(image: Tensor, truth: Tensor) -> float:
-    """Over the full scale, away from the border, where the scene beyond it is unknown."""
+    """Return the PSNR over full scale, without the border, where the scene outside is unknown."""
     difference = (image - truth)[8:-8, 8:-8].double()
     return float(10 * torch.log10(NOMINAL.max_dn**2 / difference.square().mean()))
 
 
-def restored_db(pair: Seen, pipeline: TraditionalPipeline) -> float:
+def restored_db(pair: AcquiredPair, pipeline: TraditionalPipeline) -> float:
     return psnr_db(restore_traditional(pair.degraded, pipeline), pair.reference)
 
 
@@ -72,13 +73,14 @@ NOISY = replace(NOMINAL, mtf_nyquist=0.03, alpha=ALPHA, beta=BETA)
 
 
 @pytest.mark.parametrize(("sensor", "gain_db"), [(NOMINAL, 12.9), (NOISY, 9.6)])
-def test_both_orders_of_the_chain_gain_as_many_decibels_as_were_measured(
+def test_both_orders_of_the_pipeline_gain_the_measured_decibels(
     sensor: Instrument, gain_db: float, camera: Tensor
 ) -> None:
-    """Denoising first gains 13.09 and 9.78 dB, deconvolving first 13.35 and 10.10 dB, which is
-    never more than 0.1 dB worse.
+    """Denoising first gains 13.09 and 9.78 dB, deconvolving first 13.35 and 10.10 dB (measured).
+
+    Deconvolving first is never more than 0.1 dB worse.
     """
-    pair = seen_by(camera, sensor)
+    pair = acquired_pair(camera, sensor)
     before = psnr_db(pair.degraded, pair.reference)
     gains = dict[Order, float]()
     for order in ORDERS:
@@ -94,7 +96,7 @@ def test_both_orders_of_the_chain_gain_as_many_decibels_as_were_measured(
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_strips_change_no_bit(order: Order, pair: Seen) -> None:
+def test_strips_change_no_bit(order: Order, pair: AcquiredPair) -> None:
     pipeline = TraditionalPipeline(NOMINAL, REFERENCE, "fast", order)
     dn = pair.degraded.clone()
     dn[:9, 20:50] = torch.nan
@@ -105,7 +107,7 @@ def test_strips_change_no_bit(order: Order, pair: Seen) -> None:
     assert torch.equal(at_once.isnan(), dn.isnan())
 
 
-def test_the_gain_of_each_sensor_is_its_own(pair: Seen) -> None:
+def test_the_gain_of_each_sensor_is_its_own(pair: AcquiredPair) -> None:
     crop = pair.degraded[:37, :45]
     same = restore_traditional(crop, TraditionalPipeline(NOMINAL, REFERENCE, "fast"))
     half = restore_traditional(
@@ -127,17 +129,17 @@ def test_a_black_and_a_saturated_image(level: float, sensor: Instrument) -> None
 
 
 def leaning_disc() -> PointSpread:
-    """A disc of defocus, brighter to one side."""
+    """Return a disc of defocus that is brighter on one side."""
     y, x = np.mgrid[-16:17, -16:17] / 8
     disc = np.hypot(y, x) < 0.85
     return point_spread(disc + 2.0 * (disc & (x + y > 0.4)), 8.0)
 
 
-def test_the_chain_restores_a_point_spread_as_the_formula_it_was_made_of(camera: Tensor) -> None:
+def test_a_point_spread_of_the_formula_is_restored_as_well_as_the_formula(camera: Tensor) -> None:
     formula = replace(NOMINAL, mtf_nyquist=0.12, mtf_nyquist_along=0.05)
     point = with_response(NOMINAL, formula_point(formula.mtf_axes, 2, 129, odd=True))
     levels_db = [
-        restored_db(seen_by(camera, sensor), TraditionalPipeline(sensor, REFERENCE))
+        restored_db(acquired_pair(camera, sensor), TraditionalPipeline(sensor, REFERENCE))
         for sensor in (formula, point)
     ]
     assert levels_db[1] == pytest.approx(levels_db[0], abs=0.05)
@@ -149,8 +151,9 @@ DISC = with_response(NOMINAL, leaning_disc())
 WRONG = [(NOMINAL, replace(NOMINAL, alpha=0.5), "denoise-first")]
 WRONG += [(AXES, TURNED, "denoise-first")]
 WRONG += [(DISC, replace(DISC, response=None), order) for order in ORDERS]
-"""A sensor, and the one that the pipeline is given: the formula with the contrasts of a leaning
-disc is another blur.
+"""A sensor, the wrong one given to the pipeline, and the order of the steps.
+
+The formula with the contrasts of a leaning disc is another blur than the disc.
 """
 
 
@@ -158,7 +161,7 @@ disc is another blur.
 def test_the_wrong_sensor_costs_decibels(
     sensor: Instrument, profile: Instrument, order: Order, camera: Tensor
 ) -> None:
-    pair = seen_by(camera, sensor)
+    pair = acquired_pair(camera, sensor)
     right, wrong = (
         restored_db(pair, TraditionalPipeline(stated, REFERENCE, order=order))
         for stated in (sensor, profile)
@@ -169,7 +172,7 @@ def test_the_wrong_sensor_costs_decibels(
 @pytest.mark.parametrize("name", ["wiener", "nl-means"])
 def test_baselines_undo_the_whole_response(name: str, camera: Tensor) -> None:
     sensor = with_response(NOMINAL, leaning_disc())
-    pair = seen_by(camera, sensor)
+    pair = acquired_pair(camera, sensor)
     right, wrong = (
         psnr_db(
             BASELINES[name](pair.degraded, TraditionalPipeline(profile, REFERENCE)), pair.reference
@@ -186,7 +189,7 @@ def test_any_bits_are_restored(bits: int, camera: Tensor) -> None:
     degraded, reference = (
         replace(s, bits=bits, gain_dn_per_radiance=gain) for s in (NOMINAL, NOISE_FREE)
     )
-    pair = seen_by(camera, degraded, reference)
+    pair = acquired_pair(camera, degraded, reference)
     restored = restore_traditional(pair.degraded, TraditionalPipeline(degraded, reference))
     before, after = (
         psnr_db(dn * (4095 / (2**bits - 1)), pair.reference * (4095 / (2**bits - 1)))

@@ -1,6 +1,4 @@
-"""The regularisation that is derived from the image: what changes it, what does not, and what it is
-worth.
-"""
+"""Tests of the regularization derived from the image: its dependencies and its benefit."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -32,8 +30,8 @@ from beers_deploy.profiles.instrument import Instrument
 from tests.model.simulator.stages import NOMINAL, REFERENCE
 from tests.model.traditional.test_pipeline import (
     NOISE_FREE,
+    acquired_pair,
     restored_db,
-    seen_by,
 )
 
 SIZES = st.tuples(st.integers(1, 40), st.integers(1, 40))
@@ -89,13 +87,13 @@ def test_epsilon_grows_with_the_noise_and_falls_with_the_contrast(seed: int, tim
     assert epsilon_of([dn], noisier) > usual
     flatter = dn.mean() + (dn - dn.mean()) / times
     assert epsilon_of([flatter]) > usual
-    # Equal differences that a sharper sensor sees mean a fainter scene.
+    # If a sharper sensor sees the same differences, the scene has less contrast.
     assert epsilon_of([dn], replace(NOMINAL, mtf_nyquist=0.2)) > usual
 
 
 @given(seed=SEEDS, factor=st.floats(0.1, 10))
-def test_a_change_of_the_unit_of_radiance_leaves_epsilon(seed: int, factor: float) -> None:
-    """Radiance and noise scale together: the same digital numbers, of a sensor of another gain."""
+def test_a_change_of_the_unit_of_radiance_keeps_epsilon(seed: int, factor: float) -> None:
+    """Radiance and noise scale together, so the digital numbers stay the same."""
     dn = walk((25, 37), seed)
     gain = NOMINAL.gain_dn_per_radiance / factor
     scaled = replace(
@@ -116,7 +114,7 @@ def test_missing_and_saturated_areas_do_not_count(seed: int) -> None:
         assert epsilon_of([below]) == epsilon_of([dn])
 
 
-def test_a_bright_point_that_comes_to_saturate_changes_little() -> None:
+def test_a_bright_point_that_saturates_changes_little() -> None:
     dn = torch.full((32, 32), 200.0)
     dn[16, 16] = 4094.0
     bright = epsilon_of([dn])
@@ -141,7 +139,7 @@ def test_images_without_contrast_get_a_finite_epsilon(dn: Tensor, sensor: Instru
 
 @given(seed=SEEDS, mean_dn=st.floats(1, 3000))
 def test_epsilon_is_bounded_by_the_share_of_noise(seed: int, mean_dn: float) -> None:
-    """So that faint patterns near Nyquist are not erased: see `LARGEST_PER_NOISE`."""
+    """The bound keeps faint patterns near Nyquist: see `LARGEST_PER_NOISE`."""
     dn = walk((23, 31), seed, step_dn=1.0, mean_dn=mean_dn)
     statistics = measure([dn], NOMINAL)
     share = float(statistics.noise) ** 0.5 / statistics.radiance
@@ -153,7 +151,7 @@ def test_infinite_pixels_are_refused() -> None:
         TraditionalPipeline(NOMINAL, REFERENCE).fitted_to([torch.full((3, 3), torch.inf)])
 
 
-def test_strips_need_an_epsilon_and_one_that_is_given_stays() -> None:
+def test_strips_need_an_epsilon_and_a_given_one_is_kept() -> None:
     pipeline = TraditionalPipeline(NOMINAL, REFERENCE)
     dn = walk((9, 9))
     with pytest.raises(OptionError, match="fitted_to"):
@@ -163,7 +161,7 @@ def test_strips_need_an_epsilon_and_one_that_is_given_stays() -> None:
 
 
 def test_the_restored_mtf_comes_near_that_of_the_reference() -> None:
-    """The reference has 25 %; the rule that knew the noise alone restored 16 % (measured)."""
+    """The reference has 25 %; an earlier rule, of the noise alone, restored 16 % (measured)."""
     mtfs = [
         restored_mtf(angle_deg, number) for number, angle_deg in enumerate((3.0, 5.0, 8.0, 11.0))
     ]
@@ -183,9 +181,9 @@ def restored_mtf(angle_deg: float, number: int) -> float:
 
 
 def test_a_dark_scene_gets_more_regularisation_and_gains_from_it(camera: Tensor) -> None:
-    """At 1/20 of the radiance what suits the bright scene loses, and the other way round."""
+    """At 1/20 of the radiance the bright scene's epsilon gives a lower PSNR, and vice versa."""
     reference = replace(NOISE_FREE, gain_dn_per_radiance=NOMINAL.gain_dn_per_radiance)
-    bright, dark = (seen_by(camera * share, NOMINAL, reference) for share in (1, 1 / 20))
+    bright, dark = (acquired_pair(camera * share, NOMINAL, reference) for share in (1, 1 / 20))
     pipeline = TraditionalPipeline(NOMINAL, REFERENCE)
     for_bright, for_dark = (pipeline.fitted_to([view.degraded]) for view in (bright, dark))
     assert for_bright.epsilon is not None

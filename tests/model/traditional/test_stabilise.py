@@ -1,6 +1,4 @@
-"""Variance stabilisation: unit variance, an exact inverse, and the limits where formulas usually
-break.
-"""
+"""Tests of variance stabilization: unit variance, an exact inverse, and limits of the formula."""
 
 from dataclasses import replace
 
@@ -40,7 +38,7 @@ def test_round_trip_in_float32(sensor: Instrument) -> None:
     torch.testing.assert_close(there_and_back, radiance, rtol=1e-5, atol=1e-6)
 
 
-def test_below_zero_it_goes_on_and_comes_back() -> None:
+def test_below_zero_it_rises_and_is_inverted() -> None:
     radiance = torch.linspace(-5, 5, 101)
     stable = stabilise(radiance, NOMINAL)
     assert bool((stable.diff() > 0).all())
