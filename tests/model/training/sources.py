@@ -1,4 +1,4 @@
-"""Patches of a small drawn scene, for tests of what trains on them."""
+"""Patches of a small procedural scene, for the tests of training."""
 
 from dataclasses import replace
 from functools import cache
@@ -28,7 +28,7 @@ def source(
     *,
     conditioned: bool = False,
 ) -> PatchSource:
-    """Batches of three, of one variable sensor or of a family of sensors."""
+    """Return a source of batches of three, of one variable sensor or of a family of sensors."""
     recipe = PatchRecipe(
         Sensor.load("pleiades-variable"), Sensor.load("pleiades-reference"), patch_px=patch_px
     )

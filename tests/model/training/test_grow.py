@@ -1,4 +1,4 @@
-"""Growing keeps the function, and leaves what was added free to learn."""
+"""Tests that growing keeps the function of a network, and that the added parts can learn."""
 
 import pytest
 import torch
@@ -22,7 +22,7 @@ def network(features: int) -> ConvBEERS:
 
 LARGER = [Variant(2, 6), Variant(2, 18), Variant(3, 6), Variant(5, 12), Variant(4, 6)]
 LARGER += [Variant(2, 24, 2), Variant(3, 48, 2), Variant(2, 54, 3)]
-"""Coarser ones too: at scale S a feature becomes S x S."""
+"""Some are coarser: at scale S a feature becomes S x S features."""
 
 
 def image() -> torch.Tensor:
@@ -68,7 +68,7 @@ def test_a_coarser_network_grows_from_one_of_its_own_scale() -> None:
 
 
 def test_the_pixels_of_a_place_learn_different_things() -> None:
-    """Else a coarser network would keep to what the finer one could have learnt."""
+    """Otherwise a coarser network could learn no more than the finer one."""
     coarse = grown(network(6), Variant(2, 24, 2))
     coarse(image()).abs().sum().backward()
     weight = dict(coarse.named_parameters())["body.0.first.weight"]

@@ -1,4 +1,4 @@
-"""The loss: its terms, their balance, and gradients that stay finite where images are equal."""
+"""Tests of the loss: its terms, their balance, and finite gradients where images are equal."""
 
 import math
 
@@ -17,7 +17,7 @@ def images(side: int = 33, batch: int = 2, seed: int = 0) -> tuple[Tensor, Tenso
 
 
 class Distance(nn.Module):
-    """Stands for LPIPS where only the sum is tested."""
+    """A replacement for LPIPS in tests of the sum alone."""
 
     def forward(self, restored: Tensor, reference: Tensor) -> Tensor:
         return (restored - reference).square().mean((1, 2, 3))
@@ -50,10 +50,8 @@ def test_the_terms_add_up() -> None:
     torch.testing.assert_close(total, expected)
 
 
-def test_a_psnr_term_is_lost_psnr_and_no_patch_counts_more() -> None:
-    """A tenth of the error on one patch of two is worth 10 dB in the mean, whichever of the two it
-    is.
-    """
+def test_a_psnr_term_is_the_loss_of_psnr_and_weighs_all_patches_equally() -> None:
+    """A tenth of the error on one of two patches gains 10 dB in the mean, for either patch."""
     generator = torch.Generator().manual_seed(0)
     reference = torch.rand(2, 1, 13, 17, generator=generator)
     errors = (

@@ -1,6 +1,4 @@
-"""A pass simulated in torch shows what the simulator shows, and gives the ground the look that was
-drawn.
-"""
+"""Tests that a pass simulated in torch equals the simulator, and applies the drawn look."""
 
 from dataclasses import replace
 
@@ -30,7 +28,7 @@ from tests.model.simulator.stages import NOMINAL, lopsided_point, with_response
 PLAIN = Look(1.0)
 
 
-def of_table(seed: int) -> Instrument:
+def with_table(seed: int) -> Instrument:
     return with_response(NOMINAL, draw_table(0.1, 0.06, np.random.default_rng(seed)))
 
 
@@ -39,15 +37,15 @@ SENSORS = {
     "two axes": replace(NOMINAL, mtf_nyquist_along=0.03),
     "smear": replace(NOMINAL, effects={"smear": Smear(0.8)}),
     "anti-alias": replace(NOMINAL, effects={"antialias": AntiAlias(0.3)}),
-    "table": of_table(0),
-    "another table": of_table(1),
+    "table": with_table(0),
+    "another table": with_table(1),
     "point-spread function": with_response(NOMINAL, lopsided_point()),
 }
 
 
 @pytest.mark.parametrize("ratio", [2, 3, 5])
 @pytest.mark.parametrize("name", SENSORS)
-def test_a_pass_shows_what_the_simulator_shows(name: str, ratio: int) -> None:
+def test_a_pass_equals_the_simulator(name: str, ratio: int) -> None:
     scene = procedural_scene(307, 331, np.random.default_rng(4))
     sensor = SENSORS[name]
     phase = (0.3, -0.8)
@@ -60,21 +58,21 @@ def test_a_pass_shows_what_the_simulator_shows(name: str, ratio: int) -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(st.floats(0.02, 3), st.floats(0.05, 1), st.floats(0, 1.5))
-def test_a_look_keeps_the_mean_times_its_light_and_the_contrast_that_it_says(
+def test_a_look_multiplies_the_mean_and_the_contrast_by_its_factors(
     light: float, contrast: float, softness_px: float
 ) -> None:
     radiance = torch.rand(36, 44, generator=torch.Generator().manual_seed(0))
     fy = torch.fft.fftfreq(36)
     fx = torch.fft.rfftfreq(44)
     transformed = with_look(torch.fft.rfft2(radiance), Look(light, contrast, softness_px), fy, fx)
-    looked_at = torch.fft.irfft2(transformed, s=radiance.shape)
-    assert float(looked_at.mean()) == pytest.approx(light * float(radiance.mean()), rel=1e-4)
-    contrast_ratio = float(looked_at.std()) / (light * contrast * float(radiance.std()))
+    changed = torch.fft.irfft2(transformed, s=radiance.shape)
+    assert float(changed.mean()) == pytest.approx(light * float(radiance.mean()), rel=1e-4)
+    contrast_ratio = float(changed.std()) / (light * contrast * float(radiance.std()))
     assert contrast_ratio <= 1.0001
     if softness_px == 0:
         assert contrast_ratio == pytest.approx(1, rel=1e-4)
         torch.testing.assert_close(
-            looked_at - looked_at.mean(),
+            changed - changed.mean(),
             light * contrast * (radiance - radiance.mean()),
             rtol=0,
             atol=1e-5,
@@ -123,8 +121,8 @@ def test_noise_has_the_sensors_standard_deviation_at_every_level(level: float) -
     assert torch.equal(noisy, noisy.round())
 
 
-def test_effects_of_a_profile_are_the_simulators() -> None:
-    """An offset, which torch does not know, is added."""
+def test_effects_of_a_profile_are_those_of_the_simulator() -> None:
+    """An offset, which the code in torch does not simulate itself, is added."""
     sensor = replace(NOMINAL, effects={"offset": Offset(64.0)})
     signal = torch.full((40, 50), 80.0)
     plain, shifted = (

@@ -1,4 +1,4 @@
-"""Patches made on the fly, and from pairs on disk."""
+"""Tests of patches that are simulated during training, and of patches from pairs on disk."""
 
 import os
 import subprocess
@@ -49,8 +49,8 @@ PATCHES = "from tests.model.training.sources import source; made = source().batc
 
 
 @pytest.mark.slow
-def test_who_takes_the_patches_keeps_its_threads() -> None:
-    """In processes of their own: a thread decides once how many it has."""
+def test_drawing_patches_keeps_the_number_of_threads() -> None:
+    """Each case needs its own process, because torch sets a thread's number of threads once."""
     thread_counts = [threads_after(work) for work in ("pass", PATCHES)]
     assert thread_counts[0] == thread_counts[1]
 
@@ -67,28 +67,26 @@ def threads_after(work: str) -> str:
 
 
 class OneSensor(SensorFamily):
-    """A family of one, sharp across the track and blurred along it."""
+    """A family of one sensor, sharp across the track and blurred along it."""
 
     def draw(self, _generator: np.random.Generator) -> Instrument:
         return replace(self.like, mtf_nyquist=0.15, mtf_nyquist_along=0.03, alpha=0.0, beta=0.0)
 
 
 class Alike(SensorFamily):
-    """A family of one."""
+    """A family of one sensor, which is `like`."""
 
     def draw(self, _generator: np.random.Generator) -> Instrument:
         return self.like
 
 
 def steps(image: torch.Tensor) -> tuple[float, float]:
-    """Mean difference of neighbours, along a row and down a column."""
+    """Return the mean difference of neighbours, along a row and down a column."""
     return float(image.diff(dim=-1).abs().mean()), float(image.diff(dim=-2).abs().mean())
 
 
-def test_a_turned_patch_comes_with_the_sensor_as_it_lies() -> None:
-    """A patch has lost more along the axis that its vector and its bank call
-    the more blurred one.
-    """
+def test_a_turned_patch_has_the_vector_and_the_bank_of_the_turned_sensor() -> None:
+    """A patch is more blurred along the axis that is blurred in its vector and its bank."""
     scene = Scene("noise", 100 + 60 * np.random.default_rng(0).random((420, 480), np.float32))
     recipe = replace(
         source().recipe,
@@ -115,7 +113,7 @@ def test_a_turned_patch_comes_with_the_sensor_as_it_lies() -> None:
     assert ways == {True, False}
 
 
-def test_conditioned_patches_come_with_vectors_of_many_sensors_and_the_same_again() -> None:
+def test_conditioned_patches_have_vectors_of_many_sensors_and_repeat() -> None:
     first, repeated = ([*islice(source(conditioned=True).batches(k), 20 - k)] for k in (0, 17))
     vectors = torch.cat([batch.condition.vectors for batch in first if batch.condition is not None])
     assert vectors.shape == (60, 4)
@@ -123,10 +121,8 @@ def test_conditioned_patches_come_with_vectors_of_many_sensors_and_the_same_agai
     assert all(equal(one, two) for one, two in zip(first[17:], repeated, strict=True))
 
 
-def test_dark_patches_are_those_of_a_brighter_sensor_as_a_restoration_shows_them() -> None:
-    """No patch could be brightened once more, and the noise that the network is told grows with the
-    factor.
-    """
+def test_dark_patches_are_brightened_as_in_a_restoration() -> None:
+    """No patch could be brightened further, and the noise in its vector grows with the factor."""
     family = Alike(replace(NOMINAL, alpha=0.0, beta=(100 / 200) ** 2))
     looks = Looks(lit_share=1.0, calm_share=0.3, soft_share=0.3)
     recipe = replace(source().recipe, family=family, looks=looks)
@@ -150,8 +146,8 @@ def test_dark_patches_are_those_of_a_brighter_sensor_as_a_restoration_shows_them
     assert len(applied) > 1
 
 
-def test_a_blind_network_sees_the_axes_of_one_sensor_as_they_are() -> None:
-    """Half turns and mirrors only: what is sharper across the track stays so."""
+def test_patches_of_one_sensor_keep_its_axes() -> None:
+    """Without a condition, patches are only turned by 180 degrees or mirrored."""
     scene = Scene("noise", 100 + 60 * np.random.default_rng(0).random((420, 480), np.float32))
     profile = Sensor.load("pleiades-degraded")
     across, along = (replace(profile.mtf_nyquist, value=value) for value in (0.3, 0.03))
@@ -210,7 +206,7 @@ def test_cut_takes_whole_patches_and_turn_keeps_pairs_together() -> None:
 
 
 def test_two_workers_share_the_batches_of_one() -> None:
-    """Shard by shard in turn: together they see what one alone would see."""
+    """The workers take shards in turn, so together they read the batches of a single worker."""
     alone = source().batches()
     shards = [list(islice(alone, PatchSource.SHARD_BATCHES)) for _ in range(2)]
     for rank in range(2):
@@ -218,10 +214,8 @@ def test_two_workers_share_the_batches_of_one() -> None:
         assert all(equal(next(own), batch) for batch in shards[rank])
 
 
-def stored(folder: Path, *degraded: np.ndarray) -> StoredPairs:
-    """Pairs of these images and such as are twice as bright; three of noise
-    where none are given.
-    """
+def write_pairs(folder: Path, *degraded: np.ndarray) -> StoredPairs:
+    """Write pairs of these images, by default three of noise, with references twice as bright."""
     noise = (
         np.random.default_rng(k).integers(0, 2048, (41, 53)).astype(np.uint16) for k in range(3)
     )
@@ -232,7 +226,7 @@ def stored(folder: Path, *degraded: np.ndarray) -> StoredPairs:
 
 
 def test_stored_pairs_are_cut_alike_and_the_same_from_anywhere(tmp_path: Path) -> None:
-    pairs = stored(tmp_path)
+    pairs = write_pairs(tmp_path)
     straight = pairs.batches()
     batches = [next(straight) for _ in range(4)]
     degraded, reference, _ = batches[3]
@@ -244,9 +238,9 @@ def test_stored_pairs_are_cut_alike_and_the_same_from_anywhere(tmp_path: Path) -
 
 @pytest.mark.parametrize("quarters", [True, False])
 def test_stored_pairs_of_two_different_axes_keep_them(quarters: bool, tmp_path: Path) -> None:
-    """Rows of one brightness each stay rows, unless a patch may be turned by a quarter."""
+    """Rows of one brightness stay rows, unless patches may be turned by 90 degrees."""
     rows = np.repeat(np.arange(41, dtype=np.uint16)[:, None] * 45, 53, 1)
-    patches, *_ = next(replace(stored(tmp_path, rows), batch=32, quarters=quarters).batches())
+    patches, *_ = next(replace(write_pairs(tmp_path, rows), batch=32, quarters=quarters).batches())
     flat = [bool((patch == patch[..., :1]).all()) for patch in patches]
     assert any(flat)
     assert all(flat) is not quarters
@@ -265,11 +259,11 @@ def test_stored_pairs_of_another_scale_are_refused(
     pixels: np.ndarray, words: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ImageError, match=words):
-        next(stored(tmp_path, pixels).batches())
+        next(write_pairs(tmp_path, pixels).batches())
 
 
 def test_stored_pairs_too_small_or_incomplete_are_refused(tmp_path: Path) -> None:
-    pairs = replace(stored(tmp_path), patch_px=42)
+    pairs = replace(write_pairs(tmp_path), patch_px=42)
     with pytest.raises(ImageError, match="42 pixels"):
         next(pairs.batches())
     (tmp_path / "degraded" / "p1.tif").unlink()

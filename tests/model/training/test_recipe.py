@@ -1,4 +1,4 @@
-"""Recipes: the shipped ones can be run, and a wrong one gets one sentence."""
+"""Tests that the shipped recipes load, and that a wrong recipe gets one sentence."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ WHOLE = f'variant = "convbeers-xs"\n{STAGE}'
 
 
 @pytest.mark.parametrize("name", recipe_names())
-def test_a_shipped_recipe_is_that_of_the_network_of_its_name(name: str) -> None:
+def test_a_shipped_recipe_fits_the_network_of_its_name(name: str) -> None:
     recipe = load_recipe(name)
     variant = VARIANTS[recipe.variant]
     assert read_conditioned(shipped_weights(name)).variant == variant
@@ -31,7 +31,7 @@ def test_every_recipe_is_of_a_shipped_network() -> None:
     assert all(path.suffix == ".toml" for path in RECIPES.iterdir() if path.name != "__pycache__")
 
 
-def test_what_a_recipe_leaves_out_has_its_default(tmp_path: Path) -> None:
+def test_a_key_that_a_recipe_leaves_out_has_its_default(tmp_path: Path) -> None:
     (tmp_path / "own.toml").write_text(WHOLE)
     recipe = load_recipe(str(tmp_path / "own.toml"))
     assert (recipe.seed, recipe.patch_px, recipe.stages[0].batch, recipe.looks.lit_share) == (
@@ -78,6 +78,6 @@ def test_a_wrong_recipe_gets_one_sentence(text: str, words: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize("name", ["none.toml", "convbeers-huge"])
-def test_no_such_recipe_is_said(name: str) -> None:
+def test_a_missing_recipe_is_named(name: str) -> None:
     with pytest.raises(BeersError, match=name):
         load_recipe(name)

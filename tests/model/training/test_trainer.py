@@ -41,7 +41,7 @@ def train(
     resume: bool = False,
     kill_at: int = 0,
 ) -> Trainer:
-    """Run to the end, or until a kill that leaves the checkpoint of the step before."""
+    """Train to the end, or until an interrupt that leaves the checkpoint of the step before."""
 
     def report(step: int, *_: object) -> None:
         if step == kill_at:
@@ -59,7 +59,7 @@ def train(
     return trainer
 
 
-def test_a_conditioned_run_moves_every_part_and_what_it_makes_of_a_sensor(tmp_path: Path) -> None:
+def test_a_conditioned_run_changes_every_part_of_the_network(tmp_path: Path) -> None:
     before = Trainer(VARIANT, TrainingRecipe(steps=8), conditioned=True)
     after = train(tmp_path, conditioned=True)
     changed = {
@@ -99,7 +99,7 @@ def test_killed_and_resumed_equals_unbroken_in_every_bit(
         assert all(np.array_equal(tensor, others[name]) for name, tensor in tensors.items())
 
 
-def test_a_resumed_run_goes_on_where_the_killed_one_was_saved(tmp_path: Path) -> None:
+def test_a_resumed_run_continues_where_the_killed_one_was_saved(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         train(tmp_path, kill_at=5)
     later = Trainer(VARIANT, RECIPE)
@@ -108,7 +108,7 @@ def test_a_resumed_run_goes_on_where_the_killed_one_was_saved(tmp_path: Path) ->
 
 
 class Poisoned(PatchSource):
-    """A source whose batches are NaN, all or those of some numbers."""
+    """A source whose batches are NaN: all of them, or those with the numbers `bad`."""
 
     bad: frozenset[int] | None = None
 
@@ -190,7 +190,7 @@ def test_a_second_ctrl_c_stops_at_once() -> None:
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_a_loss_that_runs_away_stops_the_run() -> None:
+def test_a_diverging_loss_stops_the_run() -> None:
     guards = Guards()
     for step in range(WINDOW_STEPS):
         guards.passed(step, 0.01)
@@ -225,7 +225,7 @@ def test_in_float32_the_network_is_the_plain_one_and_in_bfloat16_its_body_is_rou
 def test_a_run_goes_on_in_the_other_format_and_the_loss_with_it(
     first: Precision, tmp_path: Path
 ) -> None:
-    """Begun on one processor and resumed on another."""
+    """A run may start on one processor and be resumed on another."""
     other: Precision = "float32" if first == "bfloat16" else "bfloat16"
     checkpoint = tmp_path / "checkpoint.safetensors"
     records = list[tuple[int, float]]()
@@ -265,8 +265,8 @@ with joined("cpu") as worker:
 """
 
 
-class Together:
-    """The batches of two workers as one."""
+class JointBatches:
+    """A source that joins the batches of two workers."""
 
     def batches(self, first: int = 0) -> Iterator[Batch]:
         batches = [source(rank=rank, workers=2).batches(first) for rank in range(2)]
@@ -299,7 +299,7 @@ def test_two_workers_do_the_steps_of_one_with_a_batch_twice_as_large(tmp_path: P
     assert result.returncode == 0, result.stderr[-2000:]
     recipe = TrainingRecipe(steps=3, batch=3, warm_up_steps=1)
     alone, two = (Trainer(VARIANT, recipe, precision="float32") for _ in range(2))
-    alone.run(Together().batches, tmp_path / "one", Schedule())
+    alone.run(JointBatches().batches, tmp_path / "one", Schedule())
     two.resume(tmp_path / "two")
     start = Trainer(VARIANT, recipe)
     for name, value in alone.network.state_dict().items():
@@ -317,7 +317,7 @@ def test_a_recorded_step_learns_as_the_processor_does(conditioned: bool, tmp_pat
             VARIANT, TrainingRecipe(steps=60, batch=3), device=device, conditioned=conditioned
         )
         note = Schedule(20, report=lambda _, terms, __, values=values: values.append(terms["l1"]))  # type: ignore[misc]
-        # Patches of the processor for both: a GPU draws other noise.
+        # Both devices get patches drawn on the CPU, because a GPU draws other noise.
         trainer.run(source(conditioned=conditioned).batches, tmp_path / device, note)
     np.testing.assert_allclose(losses["cuda"], losses["cpu"], rtol=0.02)
 

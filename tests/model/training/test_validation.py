@@ -1,4 +1,4 @@
-"""Sites held out, and what is measured on them."""
+"""Tests of the sites that are held out, and of the measures on them."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ NAMES = (
     + [f"forest_{k:03d}.jpg" for k in range(10)]
     + ["dunes.jpg"]
 )
-EYES = Sensor.load("pleiades-degraded"), Sensor.load("pleiades-reference")
+SENSORS = Sensor.load("pleiades-degraded"), Sensor.load("pleiades-reference")
 
 
 def test_whole_sites_are_held_out_the_smallest_first_in_any_order() -> None:
@@ -37,7 +37,7 @@ def test_a_new_network_is_judged_like_its_input_also_on_odd_sides_at_half_resolu
     scale: int,
 ) -> None:
     scenes = [procedural_scene(side, side, np.random.default_rng(side)) for side in (303, 460, 90)]
-    validation = Validation(scenes, *EYES)
+    validation = Validation(scenes, *SENSORS)
     # The third scene is too small for a pair.
     assert len(validation.pairs) == 2
     assert all(side % 2 for side in validation.pairs[0][0].shape[-2:])
@@ -48,5 +48,5 @@ def test_a_new_network_is_judged_like_its_input_also_on_odd_sides_at_half_resolu
     assert validation.restore(network)[0].shape == validation.pairs[0][0].shape[-2:]
     assert judged["psnr_db"] == judged["degraded_psnr_db"]
     assert 0.5 < judged["ssim"] < 1
-    repeated = Validation(scenes, *EYES).judge(network)
+    repeated = Validation(scenes, *SENSORS).judge(network)
     assert repeated == judged
