@@ -76,7 +76,7 @@ def test_flat_ground_has_a_width_and_none_exceeds_full_scale() -> None:
     assert huge.of(flat, np.ones(flat.shape, bool)).max() == MAX_DN
 
 
-def test_an_interval_comes_back_as_it_was_stored() -> None:
+def test_a_stored_interval_is_read_back() -> None:
     assert PixelInterval.from_json(INTERVAL.to_json(), "a.onnx") == INTERVAL
     assert "\n" not in INTERVAL.to_json()
 

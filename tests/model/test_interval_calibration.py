@@ -65,7 +65,7 @@ def test_the_quantile_is_that_of_puncc(level: int) -> None:
             assert conformal_quantile(scores, level) == pytest.approx(float(plain), rel=1e-12)
 
 
-def test_a_new_group_is_covered_as_often_as_the_level_says() -> None:
+def test_a_new_group_is_covered_at_the_level() -> None:
     """Over many calibrations the mean coverage of one more group is the level or a little more."""
     covered = []
     for seed in range(400):

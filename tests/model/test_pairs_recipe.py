@@ -75,7 +75,7 @@ def test_a_recipe_of_another_kind_is_refused(tmp_path: Path, text: str) -> None:
 
 
 @pytest.mark.parametrize("name", sensor_names())
-def test_a_profile_comes_back_from_json(name: str) -> None:
+def test_a_profile_is_read_back_from_json(name: str) -> None:
     profile = Sensor.load(name)
     assert validated(Sensor, json.loads(json.dumps(asdict(profile))), "a test") == profile
 

@@ -38,7 +38,7 @@ def conditioned() -> BankedConvBEERS:
 @pytest.mark.parametrize(
     "network", [*(plain(Variant(*size)) for size in ((0, 1), (1, 4, 2), (3, 5))), conditioned()]
 )
-def test_a_network_comes_back_as_it_was(network: Network, tmp_path: Path) -> None:
+def test_a_saved_network_is_loaded_unchanged(network: Network, tmp_path: Path) -> None:
     path = tmp_path / "made" / "w.safetensors"
     save_network(path, network, {"loss": "L1", "steps": 7})
     loaded, recipe = load_network(path)

@@ -173,7 +173,7 @@ def test_a_wrong_target_gets_one_sentence(
         assert word in str(caught.value)
 
 
-def test_a_target_names_what_it_lacks() -> None:
+def test_a_target_names_a_missing_constant() -> None:
     target = TargetProfile.load("vck190")
     with pytest.raises(ProfileError, match=r"vck190.*\[magic\] wand"):
         target.value("magic", "wand")

@@ -110,7 +110,7 @@ def test_beyond_its_own_nyquist_frequency_a_point_spread_is_0(tmp_path: Path) ->
 
 @settings(max_examples=25)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 99))
-def test_packed_samples_come_back(height: int, width: int, seed: int) -> None:
+def test_packed_samples_are_unpacked_unchanged(height: int, width: int, seed: int) -> None:
     values = np.random.default_rng(seed).normal(size=(height, width)).astype(np.float32)
     assert (unpacked(PointSpread(height, width, 8.0, packed(values))) == values).all()
 
@@ -147,7 +147,7 @@ def test_any_type_of_number_is_the_same_instrument(dtype: str, tmp_path: Path) -
 
 @pytest.mark.parametrize("mtf", [TABLE, PSF])
 @pytest.mark.parametrize("noise", [None, "alpha = 0.0077\nbeta = [0.05, 0.07]"])
-def test_a_profile_comes_back_from_json_without_its_file(
+def test_a_profile_is_read_back_from_json_without_its_file(
     mtf: str, noise: str | None, tmp_path: Path
 ) -> None:
     np.save(tmp_path / "psf.npy", lopsided())

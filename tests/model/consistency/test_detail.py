@@ -47,7 +47,7 @@ def test_it_is_used_where_the_curve_departs_from_the_formula(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["smear", "lopsided point", "narrow point"])
-def test_a_consistent_pair_stays(name: str) -> None:
+def test_a_consistent_pair_hardly_changes(name: str) -> None:
     """The change is 0.4 to 2.5 DN rms at 480 DN of contrast (measured).
 
     The control has another blur.
@@ -78,7 +78,7 @@ def test_an_error_of_detail_is_removed_in_noise(size_px: float) -> None:
     assert rms(rest) < 0.8 * rms(coarse_rest)
 
 
-def test_a_third_of_the_noise_comes_back_on_even_ground() -> None:
+def test_a_third_of_the_noise_returns_on_flat_ground() -> None:
     ground = np.full(scene().shape, 1500.0)
     sigma = sigma_dn(GAUSSIAN, 1500)
     added = detail(GAUSSIAN, noisy(ground, GAUSSIAN), ground)[INSIDE]
@@ -86,7 +86,7 @@ def test_a_third_of_the_noise_comes_back_on_even_ground() -> None:
 
 
 @pytest.mark.parametrize("share", [0.02, 0.5, 0.9])
-def test_even_ground_stays_but_for_rounding(share: float) -> None:
+def test_only_rounding_changes_flat_ground(share: float) -> None:
     ground = np.full((90, 77), share * FULL_SCALE)
     assert np.abs(detail(GAUSSIAN, ground, ground)).max() < 1e-6 * FULL_SCALE
 

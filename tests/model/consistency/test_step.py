@@ -101,7 +101,7 @@ def test_any_part_is_corrected_as_the_whole_image_is_bit_for_bit(
     width=st.one_of(st.just(1), st.integers(1, 90)),
     share=st.floats(0, 1),
 )
-def test_a_constant_image_stays(name: str, height: int, width: int, share: float) -> None:
+def test_a_constant_image_does_not_change(name: str, height: int, width: int, share: float) -> None:
     """Only rounding changes it, from where noise is no longer clipped at zero up to full scale.
 
     Measured: at most 0.002 DN, 8 units in the last place of float32.
@@ -113,7 +113,7 @@ def test_a_constant_image_stays(name: str, height: int, width: int, share: float
 
 
 @pytest.mark.parametrize("name", SENSORS)
-def test_a_consistent_pair_stays(name: str) -> None:
+def test_a_consistent_pair_hardly_changes(name: str) -> None:
     """Measured: it changes by 0.3 to 0.8 DN rms, at a contrast of 480 DN and a noise of 9 DN."""
     restored = scene()
     sensor = SENSORS[name]
@@ -148,7 +148,7 @@ def test_smooth_errors_are_removed_in_noise_and_once_is_enough(name: str, error:
 
 
 @pytest.mark.parametrize("name", ["formula", "two axes", "lopsided point", "narrow point"])
-def test_little_noise_comes_back_on_even_ground(name: str) -> None:
+def test_little_noise_returns_on_flat_ground(name: str) -> None:
     """Measured: the first application adds 0.083 sigma, a second changes 0.028 to 0.037 sigma, and
     a third 0.013 to 0.021.
 
@@ -170,7 +170,7 @@ def test_little_noise_comes_back_on_even_ground(name: str) -> None:
 
 @pytest.mark.parametrize("name", SENSORS)
 @pytest.mark.parametrize("at", [(0, 0), (3, 4), (5, 2)])
-def test_the_flux_of_an_erased_point_comes_back(name: str, at: tuple[int, int]) -> None:
+def test_the_flux_of_an_erased_point_is_restored(name: str, at: tuple[int, int]) -> None:
     """Measured within 49 x 49 pixels: 98.4 to 101.2 %; H spreads the rest farther away."""
     row, column = np.mgrid[:201, :201] - np.array([100 + at[0], 100 + at[1]])[:, None, None]
     point = 800 * np.exp(-(row**2 + column**2) / 2 / 0.8**2)

@@ -31,7 +31,7 @@ def noisy(image: np.ndarray, generator: np.random.Generator, noise: float = 4.0)
 
 @settings(deadline=None, max_examples=15)
 @given(seeds, st.integers(16, 180), st.floats(50, 3000), st.sampled_from([2.0, 4.0, 40.0]))
-def test_even_ground_has_no_lines(seed: int, width: int, level: float, noise: float) -> None:
+def test_flat_ground_has_no_lines(seed: int, width: int, level: float, noise: float) -> None:
     faults = judged(noisy(np.full((512, width), level), np.random.default_rng(seed), noise))
     assert not faults.significant
     assert not faults.off

@@ -85,7 +85,7 @@ def test_a_gaussian_edge_gives_its_mtf_wherever_it_lies(sigma_px: float, angle_d
         assert measured(crop, angle_deg) == pytest.approx(expected, abs=0.002)
 
 
-def test_what_cannot_be_measured_is_refused() -> None:
+def test_an_edge_that_cannot_be_measured_is_refused() -> None:
     edge = gaussian_edge(ANGLE_DEG, 0.6)
     generator = np.random.default_rng(0)
     assert "10 times are needed" in refused(edge + 170 * generator.standard_normal(edge.shape))

@@ -154,5 +154,5 @@ def test_places_stay_apart(place: str, other: str, frame: str) -> None:
         ("0001-drawn-00012.tif", "0001-drawn-00012"),
     ],
 )
-def test_a_site_is_what_its_names_begin_with(name: str, site: str) -> None:
+def test_a_site_is_the_common_beginning_of_its_names(name: str, site: str) -> None:
     assert site_of(name) == site

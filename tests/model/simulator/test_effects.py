@@ -137,7 +137,7 @@ def test_the_noise_is_the_same_whether_a_pattern_is_applied_or_not(name: str) ->
 @given(
     st.floats(1, 150), st.floats(0, 0.5), st.floats(0, 9), st.integers(2, 37), st.integers(0, 99)
 )
-def test_a_full_well_gives_back_no_more_than_its_share_of_what_it_cuts_off(
+def test_a_full_well_spills_no_more_than_its_share_of_what_it_cuts_off(
     well: float, share: float, length_px: float, rows: int, seed: int
 ) -> None:
     image = scene(rows, 9, seed)

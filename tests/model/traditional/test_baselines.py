@@ -18,7 +18,7 @@ def pair(camera: Tensor) -> AcquiredPair:
 
 
 @pytest.mark.parametrize("name", BASELINES)
-def test_a_baseline_gains_decibels_and_stays_behind_the_pipeline(
+def test_a_baseline_gains_decibels_and_is_worse_than_the_pipeline(
     name: str, pair: AcquiredPair
 ) -> None:
     """A baseline with a wrong gain, shift or target MTF would flatter the pipeline."""

@@ -75,7 +75,7 @@ def test_denser_references_cost_time_and_gain_quality(camera: Tensor) -> None:
 
 @pytest.mark.parametrize("name", hard_images())
 @pytest.mark.parametrize("noise", [0.0, SIGMA])
-def test_hard_images_come_back_close_to_the_truth(name: str, noise: float) -> None:
+def test_hard_images_are_restored_close_to_the_truth(name: str, noise: float) -> None:
     clean = hard_images()[name]
     restored = nl_bayes(with_noise(clean, noise), WHITE)
     assert bool(torch.isfinite(restored).all())
