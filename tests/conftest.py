@@ -1,9 +1,7 @@
-"""Machines are shared: no property test is judged by its time.
+"""Settings and fixtures of all tests.
 
-Real images lie beside the repository, or nowhere.
-
-What many tests need and no test changes is made once a process: the tree of commands and the drawn
-scenes.
+No property test has a deadline, because machines are shared. The tree of commands and the drawn
+scenes are built once a process, because many tests need them and no test changes them.
 """
 
 import os
@@ -11,8 +9,7 @@ import sys
 from functools import cache, lru_cache
 from pathlib import Path
 
-# Before any test is imported, and so before torch is: the suite runs in several processes, a core
-# each.
+# The suite runs in several processes, one core each. This must be set before a test imports torch.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
@@ -30,8 +27,9 @@ SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 @pytest.fixture(scope="session", autouse=True)
 def scenes_drawn_once() -> None:
-    """Keep the drawn scenes, where a test's imports reach them: an emulated processor is spared
-    Pillow and SciPy.
+    """Cache the drawn scenes if a test imports their module.
+
+    It is not imported here, so that tests on an emulated processor need no Pillow and SciPy.
     """
     if drawing := sys.modules.get("beers_deploy.model.simulator.procedural"):
         drawing.draw_scenes = lru_cache(maxsize=4)(drawing.draw_scenes)  # type: ignore[attr-defined]
@@ -39,16 +37,17 @@ def scenes_drawn_once() -> None:
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of real images, `shared/data` beside the repository's root."""
+    """Return the folder of real images, `shared/data` next to the repository."""
     if not SHARED_DATA.is_dir():
-        pytest.skip("no folder shared/data beside the repository: no real images to test on")
+        pytest.skip("no real images: there is no folder shared/data next to the repository")
     return SHARED_DATA
 
 
 @pytest.fixture(scope="session")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with one small drawn scene: to draw those that a command takes of itself is most of
-    its time.
+    """Return a folder with one small drawn scene.
+
+    A command without it draws its own scenes, which takes most of its time.
     """
     import numpy as np
     import tifffile

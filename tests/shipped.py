@@ -18,7 +18,7 @@ def _folder() -> Path:
 
 @cache
 def shipped_pair(name: str = VARIANT, sensor: str = SENSOR) -> tuple[Path, Path]:
-    """A shipped network in float32 and in INT8, conditioned on a sensor."""
+    """Return the files of a shipped network in float32 and INT8, conditioned on a sensor."""
     networks = [Network.load(name, sensor=sensor, int8=int8) for int8 in (False, True)]
     floating, integer = (
         network.save(_folder() / sensor / f"{network.name}.onnx") for network in networks

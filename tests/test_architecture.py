@@ -1,4 +1,4 @@
-"""What docs/explanation/architecture.md says of the packages, held against the code."""
+"""Tests that docs/explanation/architecture.md and the packages' docstrings agree with the code."""
 
 import ast
 from graphlib import TopologicalSorter
@@ -12,26 +12,26 @@ ROOT = Path(__file__).resolve().parents[1]
 INSIDE: list[Path] = []
 for folder in PACKAGES:
     INSIDE += sorted((ROOT / folder).rglob("__init__.py"))
-"""What says what a package holds."""
+"""The modules whose docstrings say what a package contains."""
 MOST_MODULES = 18
 
 
-def test_no_module_imports_itself_by_a_detour() -> None:
-    """Imports inside functions and for types alone count too."""
+def test_imports_between_modules_have_no_cycle() -> None:
+    """Imports inside functions and imports for types count too."""
     paths = modules()
     order = TopologicalSorter({name: imports_of(path, paths) for name, path in paths.items()})
     # A cycle raises CycleError, which names its modules.
     assert len(list(order.static_order())) == len(paths)
 
 
-def test_packages_stay_small_enough_to_look_through_and_say_what_is_inside() -> None:
+def test_packages_are_small_and_have_a_docstring() -> None:
     for path in INSIDE:
         neighbours = [file for file in path.parent.glob("*.py") if file != path]
         assert len(neighbours) <= MOST_MODULES, path.parent
         assert ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))), path
 
 
-def test_the_page_names_files_that_are_there() -> None:
+def test_files_that_the_page_names_exist() -> None:
     page = (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8")
     mentions = {
         word
@@ -42,15 +42,16 @@ def test_the_page_names_files_that_are_there() -> None:
     assert not [word for word in mentions if not (ROOT / word).exists()]
 
 
-def test_the_picture_is_drawn_from_the_imports_of_today() -> None:
-    """Else run python docs/make/architecture.py."""
+def test_the_drawing_agrees_with_the_imports() -> None:
+    """If this fails, run python docs/make/architecture.py."""
     page = (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8")
     assert drawn(page) == page
 
 
 def listed(docstring: str) -> set[str]:
-    """The modules that a list in a package's docstring is about: those before a colon, or the first
-    of a clause.
+    """Return the modules that the list in a package's docstring describes.
+
+    They are the names before a colon, or the first name of a clause.
     """
     clauses = list[str]()
     for line in docstring.splitlines():
@@ -64,7 +65,7 @@ def listed(docstring: str) -> set[str]:
     return {word for word in chain.from_iterable(about) if word.isidentifier()}
 
 
-def test_a_package_says_what_is_inside_by_names_that_are_there() -> None:
+def test_modules_that_a_package_docstring_lists_exist() -> None:
     for path in INSIDE:
         docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
         here = {entry.stem for entry in path.parent.iterdir()}

@@ -1,4 +1,4 @@
-"""What the library offers by name: a change here is a change for whoever imports it."""
+"""Tests of the library's public names: a change here affects everyone who imports them."""
 
 import subprocess
 import sys
@@ -16,7 +16,7 @@ LIGHT = (
     "beers_deploy.model.raster.images",
     "beers_deploy.quant",
 )
-"""Looked at by commands that need no torch."""
+"""Modules that are imported by commands that need no torch."""
 
 
 def test_the_library_offers_these_names_and_no_others() -> None:
@@ -25,7 +25,7 @@ def test_the_library_offers_these_names_and_no_others() -> None:
     assert all(hasattr(bd, name) for name in names)
 
 
-def test_packages_are_looked_at_without_torch() -> None:
+def test_light_modules_import_no_heavy_package() -> None:
     heavy = "{'torch', 'skimage', 'scipy', 'matplotlib', 'onnxruntime'}"
     code = f"import sys, {', '.join(LIGHT)}; print({heavy} & set(sys.modules))"
     process = subprocess.run(

@@ -1,10 +1,9 @@
-"""The commands of the how-to pages: where they stand, what makes them short, what they need and
-what they write.
+"""The commands of the how-to pages: how to find and shorten them, what they need and write.
 
-A command stands in a fence of a shell, in an indented block, in a cell of a table, or as code
-within a sentence. The commands of one block are one sitting: each uses what those before it wrote.
-Within a sentence `beers-deploy check` is the name of a command, and no command; in a table, where a
-reader copies it, it is one.
+A command stands in a shell fence, in an indented block, in a cell of a table, or as code within a
+sentence. The commands of one block are a session: each uses the files of those before it. Within a
+sentence `beers-deploy check` only names a command. In a table, where a reader copies it, it is a
+command.
 """
 
 import json
@@ -22,13 +21,13 @@ PAGES = sorted((ROOT / "docs" / "how-to").glob("*.md"))
 TUTORIALS = (ROOT / "docs" / "tutorials").glob("*.md")
 COMMANDS = "".join(page.read_text(encoding="utf-8") for page in TUTORIALS)
 STARTED = set(re.findall(rf"^{NAME} (\w+)", COMMANDS, re.MULTILINE))
-"""Commands that the walks of the tutorials start as a shell starts them."""
+"""Commands that the tests of the tutorials start in a process of their own."""
 PROGRAMS = {NAME, "python", "python3", "pip", "pytest", "rio", "xdputil"}
 SHELLS = {"console", "bash", "sh"}
 FENCE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?:^ {4}\S.*\n?)+", re.MULTILINE)
 
-Sitting = tuple[str, ...]
+Session = tuple[str, ...]
 
 LEFT_OUT = {
     "pip install '.[notebook,dask]' rioxarray": "fetches from a registry",
@@ -42,7 +41,7 @@ LEFT_OUT = {
     (
         "beers-deploy restore raw.tif restored.tif --network mine-calibrated.onnx "
         "--sensor mine.toml --interval 90"
-    ): "restores with what that writes",
+    ): "needs the file that the command above writes",
     (
         "beers-deploy train --recipe convbeers-xs --images aerial-train/ --images aerial-train2/ "
         "--out runs/convbeers-xs"
@@ -64,19 +63,20 @@ SHORTER = {
     r"IMAGE OUT": "raw.tif restored.tif",
     r"(beers-deploy evaluate)": r"\1 --methods degraded",
 }
-"""Patterns in a command, and what stands there instead so that a test takes seconds."""
+"""Patterns in a command and their replacements, so that a test takes seconds."""
 
 NEEDED = {
     r"\.jp2|\.vrt|\.XML|--cog|bands\.tif": "rasterio",
     r"--stac": "pystac",
     r"rio cogeo": "rio_cogeo",
 }
-"""Patterns in a command, and the package of an extra without which it is refused."""
+"""Patterns in a command, and the optional package that it needs."""
 
 
-def sittings(text: str) -> Iterator[Sitting]:
-    """The commands of a page, block by block; one within a sentence or a table is a sitting of its
-    own.
+def sessions(text: str) -> Iterator[Session]:
+    """Yield the sessions of a page.
+
+    A command within a sentence or a table is a session of its own.
     """
     text = re.sub(r"\\\n\s*", "", text)
     blocks = [body for language, body in FENCE.findall(text) if language in SHELLS]
@@ -106,21 +106,21 @@ def _is_json(block: str) -> bool:
 
 
 def shortened(command: str) -> str:
-    """The command as it is run."""
+    """Return the command as the test runs it."""
     for pattern, short in SHORTER.items():
         command = re.sub(pattern, short, command)
     return command
 
 
-def packages(sitting: Sitting) -> set[str]:
-    """Packages of extras that a sitting needs."""
+def packages(session: Session) -> set[str]:
+    """Return the optional packages that a session needs."""
     return {
-        package for pattern, package in NEEDED.items() if re.search(pattern, "\n".join(sitting))
+        package for pattern, package in NEEDED.items() if re.search(pattern, "\n".join(session))
     }
 
 
 def outputs(command: str) -> list[Path]:
-    """Files that a command names as its outputs, relative to its folder; of a folder one file."""
+    """Return the output files of a command, relative to its folder; one file of each folder."""
     if not command.startswith(NAME):
         return [Path(name) for name in re.findall(r"--out (\S+)", command)]
     name = shlex.split(command)[1]

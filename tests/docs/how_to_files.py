@@ -1,6 +1,4 @@
-"""The files that the how-to pages name, small: made by the program itself where
-it can make them.
-"""
+"""Small versions of the files that the how-to pages name, written by the program where possible."""
 
 import re
 import shutil
@@ -28,10 +26,10 @@ from tests.model.networks import plain
 HOW_TO = ROOT / "docs" / "how-to"
 SITES = 6
 SCENE_PX = 820
-"""As `benchmarks/characterize.py` needs them."""
+"""Number and side of the photographs, as `benchmarks/characterize.py` needs them."""
 FEW = 2
 FEW_PX = 480
-MADE = """
+COMMANDS = """
 beers-deploy simulate --images scene.png --sensor pleiades-degraded --out made
 beers-deploy export --network narrow.safetensors --out float.onnx
 beers-deploy quantize float.onnx --images aerial --patch 32 --out int8.onnx --board-file core.onnx
@@ -40,7 +38,7 @@ beers-deploy gate float.onnx int8.onnx --patches 4 --json gate-main.json
 
 
 def prepare(folder: Path) -> None:
-    """Put them into a folder."""
+    """Write the files into a folder."""
     copied_files(folder)
     scenes(folder)
     faulty_frames(folder)
@@ -49,14 +47,14 @@ def prepare(folder: Path) -> None:
     if find_spec("rasterio"):
         other_formats(folder)
     walk = Walk(folder, started=STARTED)
-    for command in MADE.split("\n")[1:-1]:
+    for command in COMMANDS.split("\n")[1:-1]:
         process = walk.run(command)
         assert process.returncode == 0, f"{command}\n{process.stdout}"
     shutil.copy(next((folder / "made" / "degraded").glob("*.tif")), folder / "raw.tif")
 
 
 def copied_files(folder: Path) -> None:
-    """Those of this project, and those that the pages show."""
+    """Copy files of this project, and write the files that the pages show."""
     shutil.copytree(
         ROOT / "benchmarks", folder / "benchmarks", ignore=shutil.ignore_patterns("__pycache__")
     )
@@ -70,7 +68,7 @@ def copied_files(folder: Path) -> None:
 
 
 def shown(page: str, pattern: str) -> str:
-    """The one part of a page that a pattern finds."""
+    """Return the only part of a page that matches a pattern."""
     (part,) = re.findall(
         pattern, (HOW_TO / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
     )
@@ -78,8 +76,9 @@ def shown(page: str, pattern: str) -> str:
 
 
 def scenes(folder: Path) -> None:
-    """Photographs of roofs and yards, drawn; and two raw images of a sensor, a checkerboard in the
-    first.
+    """Write drawn photographs of roofs and yards, and two raw images of a sensor.
+
+    The first raw image contains a checkerboard.
     """
     for name in ("aerial", "aerial-train"):
         (folder / name).mkdir()
@@ -101,7 +100,7 @@ def scenes(folder: Path) -> None:
 
 
 def faulty_frames(folder: Path) -> None:
-    """Two frames of a camera with a dead column and a hot pixel."""
+    """Write two frames of a camera with a dead column and a hot pixel."""
     for seed, name in enumerate(("frame.tif", "next.tif")):
         frame = np.rint(np.random.default_rng(seed).normal(600, 5, (90, 110)))
         frame[:, 40] = 0
@@ -110,7 +109,7 @@ def faulty_frames(folder: Path) -> None:
 
 
 def networks(folder: Path) -> None:
-    """Weights of a narrow network, and a detector that always sees the same."""
+    """Write weights of a narrow network, and a detector that always finds the same object."""
     save_network(
         folder / "narrow.safetensors", plain(Variant(1, 4)), {"degraded": "pleiades-degraded"}
     )
@@ -118,13 +117,13 @@ def networks(folder: Path) -> None:
 
 
 def labelled_pictures(folder: Path) -> None:
-    """DIOR's tree, of two images."""
+    """Write two images in the folder layout of DIOR."""
     boxes: list[Object] = [("ship", 4, 4, 20, 12), ("storagetank", 30, 10, 50, 30)]
     dior(folder / "DIOR", {"test": {"00001": boxes, "00002": boxes[:1]}})
 
 
 def other_formats(folder: Path) -> None:
-    """What GDAL reads."""
+    """Write images in formats that GDAL reads."""
     from tests.model.raster import formats as images
 
     pixels = images.digital_numbers(bands=1)

@@ -1,7 +1,4 @@
-"""Every command that a page shows is read by the command line itself: a changed option fails here.
-
-None is run.
-"""
+"""Tests that the command line accepts every command that a page shows, without running it."""
 
 import re
 import shlex
@@ -21,12 +18,13 @@ PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").r
 GENERATED_FROM_IT = "commands.md"
 NAME = "beers-deploy"
 UsageError: type[Exception] = typer.BadParameter.__bases__[0]
-"""Of click, which Typer may bring itself."""
+"""The error of Click, of which Typer may bring its own copy."""
 
 
 def commands(text: str) -> Iterator[str]:
-    """Of blocks, fenced and indented, and of code within a sentence; lines that end in a backslash
-    are joined.
+    """Yield the commands in fenced and indented blocks, and in code within a sentence.
+
+    Lines that end in a backslash are joined.
     """
     for line in re.sub(r"\\\n\s*", "", text).splitlines():
         if re.match(rf"(    |\$ )?(\S+/)?{NAME} ", line):
@@ -36,7 +34,7 @@ def commands(text: str) -> Iterator[str]:
 
 
 def words_of(line: str) -> list[str]:
-    """What stands behind the program's name, up to a comment or the next program."""
+    """Return the words after the program's name, up to a comment or the next program."""
     line = line.replace("`", "").replace(r"\|", "|")
     words = shlex.split(line[line.index(NAME) :], comments=True)[1:]
     ends = [place for place, word in enumerate(words) if word in {"&&", "|", ">", "..."}]
@@ -44,9 +42,7 @@ def words_of(line: str) -> list[str]:
 
 
 def context_of(line: str) -> Any:
-    """What the command line makes of a whole command: Click's context, with the value of each
-    parameter.
-    """
+    """Return Click's context of a command, with the value of each parameter."""
     group = get_command(app)
     assert isinstance(group, TyperGroup)
     name, *words = words_of(line)
@@ -54,7 +50,7 @@ def context_of(line: str) -> Any:
 
 
 def refusal(line: str) -> str:
-    """What the command line says against it; nothing where it is read."""
+    """Return the error message of the command line, which is empty for a valid command."""
     group = get_command(app)
     assert isinstance(group, TyperGroup)
     name, *words = words_of(line) or ["--help"]
@@ -63,7 +59,7 @@ def refusal(line: str) -> str:
     if name not in group.commands:
         return f"{line}: no command {name}"
     if not words:
-        # A command's name within a sentence is no call.
+        # Within a sentence this is only the name of a command.
         return ""
     try:
         context_of(line)
@@ -75,6 +71,6 @@ def refusal(line: str) -> str:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_command_of_a_page_is_read_by_the_command_line(page: Path) -> None:
+def test_every_command_of_a_page_is_accepted_by_the_command_line(page: Path) -> None:
     lines = [] if page.name == GENERATED_FROM_IT else [*commands(page.read_text(encoding="utf-8"))]
     assert [message for message in map(refusal, lines) if message] == []

@@ -1,6 +1,4 @@
-"""The examples in the docstrings of the library run and print what they show; the README's cell
-runs.
-"""
+"""Tests that the examples in the library's docstrings and the cell of the README run."""
 
 import doctest
 import re
@@ -16,11 +14,11 @@ from tests.docs.walk import ROOT
 pytestmark = pytest.mark.slow
 
 WITHOUT_EXAMPLE = {"demo", "export", "golden", "stress", "train"}
-"""Verbs that write folders, or run for minutes: their commands in the pages are run instead."""
+"""Verbs that write folders or run for minutes. Their commands in the pages are run instead."""
 
 
 @pytest.mark.parametrize("name", vars(bd)["__all__"])
-def test_the_example_gives_what_it_shows(
+def test_the_example_prints_what_it_shows(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -1,6 +1,4 @@
-"""Every command of the how-to pages, run on small files: it ends as the page says, and what it
-names is written.
-"""
+"""Tests that every command of the how-to pages runs on small files and writes its outputs."""
 
 import shutil
 import tempfile
@@ -12,48 +10,48 @@ from tests.docs.how_to import (
     LEFT_OUT,
     PAGES,
     STARTED,
-    Sitting,
+    Session,
     outputs,
     packages,
+    sessions,
     shortened,
-    sittings,
 )
 from tests.docs.how_to_files import prepare
 from tests.docs.walk import Walk
 
 pytestmark = pytest.mark.slow
 
-FOUND = {page.stem: [*sittings(page.read_text(encoding="utf-8"))] for page in PAGES}
-RUN: dict[str, Sitting] = {}
-for page, all_commands in FOUND.items():
-    for sitting in all_commands:
-        commands = tuple(command for command in sitting if command not in LEFT_OUT)
+SESSIONS = {page.stem: [*sessions(page.read_text(encoding="utf-8"))] for page in PAGES}
+CASES: dict[str, Session] = {}
+for page, all_commands in SESSIONS.items():
+    for session in all_commands:
+        commands = tuple(command for command in session if command not in LEFT_OUT)
         if commands:
-            RUN[f"{page}, {commands[0]}"] = commands
+            CASES[f"{page}, {commands[0]}"] = commands
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the pages name."""
+    """Return a folder with the files that the pages name."""
     folder = tmp_path_factory.mktemp("how-to") / "files"
     folder.mkdir()
     prepare(folder)
     return folder
 
 
-@pytest.mark.parametrize("sitting", RUN.values(), ids=RUN)
-def test_it_runs_and_writes_what_it_names(sitting: Sitting, files: Path) -> None:
-    for package in packages(sitting):
+@pytest.mark.parametrize("session", CASES.values(), ids=CASES)
+def test_the_commands_run_and_write_their_outputs(session: Session, files: Path) -> None:
+    for package in packages(session):
         pytest.importorskip(package, reason=f"no {package}")
     with tempfile.TemporaryDirectory(dir=files.parent) as folder:
         copy = Path(shutil.copytree(files, folder, dirs_exist_ok=True))
         walk = Walk(copy, started=STARTED)
-        for command in sitting:
+        for command in session:
             run(walk, command)
 
 
 def run(walk: Walk, command: str) -> None:
-    """Run it as it is short; what it writes was not there before."""
+    """Run the shortened command, and check that it writes its outputs."""
     short = shortened(command)
     paths = [walk.folder / path for path in outputs(short)]
     for path in paths:

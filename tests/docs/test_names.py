@@ -1,6 +1,4 @@
-"""What files say of the documentation is there: paths of pages, links, keys of generated pages,
-words, exit codes.
-"""
+"""Tests that pages, links, keys, terms and versions in the project's files exist and agree."""
 
 import re
 import subprocess
@@ -45,7 +43,7 @@ def tracked() -> list[Path]:
     return [ROOT / name for name in names.split("\0") if name.endswith(texts) or name == ".ci/run"]
 
 
-def test_paths_of_the_documentation_are_there() -> None:
+def test_pages_that_files_mention_exist() -> None:
     mentions = set[tuple[Path, str]]()
     for path in tracked():
         if path.name != Path(__file__).name:
@@ -60,7 +58,7 @@ def test_paths_of_the_documentation_are_there() -> None:
 @pytest.mark.parametrize(
     "name", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "model/weights/convbeers-s.md"]
 )
-def test_links_outside_of_the_site_lead_somewhere(name: str) -> None:
+def test_links_of_pages_outside_the_site_lead_to_files(name: str) -> None:
     page = ROOT / name
     targets = LINK.findall(page.read_text(encoding="utf-8"))
     assert targets
@@ -81,7 +79,7 @@ def test_a_generated_page_is_fresh(maker: Any, document: Callable[[], str]) -> N
     assert maker.TARGET.read_text(encoding="utf-8") == document(), f"run python {maker.__file__}"
 
 
-def test_a_boards_keys_are_those_that_have_a_meaning() -> None:
+def test_the_page_explains_exactly_the_keys_of_the_boards() -> None:
     shipped = defaultdict[str, set[str]](set)
     for board in map(TargetProfile.load, board_names()):
         for table, constants in board.tables.items():
@@ -91,7 +89,7 @@ def test_a_boards_keys_are_those_that_have_a_meaning() -> None:
     assert {table: {*keys} for table, keys in target_file.KEYS.items()} == shipped
 
 
-def test_the_scenes_page_is_true_and_its_example_a_scene(tmp_path: Path) -> None:
+def test_the_page_of_scenes_is_correct_and_its_example_is_a_scene(tmp_path: Path) -> None:
     page = (DOCS / "reference" / "scene-file.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     assert {*tomllib.loads(example)} <= {"description", "radiance_scale", "without", *TABLES}
@@ -102,7 +100,7 @@ def test_the_scenes_page_is_true_and_its_example_a_scene(tmp_path: Path) -> None
     assert SceneCall.load(str(tmp_path / "mine.toml")).without == ("striping",)
 
 
-def test_the_commands_that_give_a_verdict_are_named() -> None:
+def test_the_page_of_exit_codes_names_the_commands_with_a_verdict() -> None:
     page = (DOCS / "reference" / "exit-codes.md").read_text(encoding="utf-8")
     judging = {
         name
@@ -114,13 +112,13 @@ def test_the_commands_that_give_a_verdict_are_named() -> None:
     assert {*re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE)} == judging
 
 
-def test_the_glossary_has_the_words_of_the_pages() -> None:
+def test_the_glossary_has_the_terms_of_the_pages() -> None:
     page = (DOCS / "reference" / "glossary.md").read_text(encoding="utf-8")
     terms = " ".join(re.findall(r"^- \*\*(.*?)\*\*: ", page, re.MULTILINE))
     assert [term for term in TERMS if term not in terms] == []
 
 
-def test_every_number_of_the_readme_stands_where_it_says_how_it_is_known() -> None:
+def test_every_number_of_the_readme_is_on_the_page_that_says_how_we_know() -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     page = (DOCS / "explanation" / "how-we-know.md").read_text(encoding="utf-8")
     prose = re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)", "", readme, flags=re.DOTALL)
@@ -129,7 +127,7 @@ def test_every_number_of_the_readme_stands_where_it_says_how_it_is_known() -> No
     assert numbers - set(re.findall(r"\d+(?:\.\d+)*", page)) == set()
 
 
-def test_the_citation_and_the_changelog_are_of_this_version() -> None:
+def test_the_citation_and_the_changelog_have_this_version() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     cited = dict(
         re.findall(
@@ -145,7 +143,7 @@ def test_the_citation_and_the_changelog_are_of_this_version() -> None:
     assert project["license"].split(" AND ")[0] == cited["license"]
 
 
-def test_the_site_is_built_from_what_the_extra_asks_for() -> None:
+def test_the_workflow_of_the_site_installs_the_packages_of_the_extra() -> None:
     extra = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
         "optional-dependencies"
     ]

@@ -1,6 +1,4 @@
-"""Tables of docs/results, filled from a document: those with a row for each
-method, and the others.
-"""
+"""Tests that the tables of docs/results are filled from a document of results."""
 
 from typing import Any
 
@@ -47,7 +45,7 @@ def test_tables_of_means_have_the_rows_and_columns_that_the_page_names(table: st
     assert "paper" not in page
 
 
-def test_targets_are_filled_likewise() -> None:
+def test_the_table_of_targets_is_filled() -> None:
     figures = {
         "zone plate of 8%": figure(0.5499, "of the reference", [0.5288, 0.5711]),
         "flux": figure(98, "%"),
@@ -73,6 +71,6 @@ def test_a_table_of_differences_keeps_its_empty_corner() -> None:
     ]
 
 
-def test_what_the_document_lacks_stays() -> None:
+def test_a_table_that_the_document_lacks_does_not_change() -> None:
     page = "<!-- targets -->\n| method |\n|---|\n| old |\n<!-- end -->\n"
     assert MARKED.sub(lambda match: filled({"mean": []}, match), page) == page

@@ -1,8 +1,8 @@
-"""The documentation's site, built strictly and looked at in a real browser; skipped where either is
-missing.
+"""Tests of the documentation's site, built strictly and opened in a real browser.
 
-`pip install -e '.[dev,docs]' --config-settings editable_mode=strict` brings MkDocs. Every page is
-opened at the width of a desk and of a telephone.
+They are skipped without MkDocs or a browser. MkDocs is installed by
+`pip install -e '.[dev,docs]' --config-settings editable_mode=strict`. Every page is opened at the
+width of a desktop and of a telephone.
 """
 
 import json
@@ -23,13 +23,13 @@ Run = Callable[..., Any]
 
 ROOT = Path(__file__).parents[2]
 WIDTHS_PX = (1280, 390)
-ASKED = {
+SEARCHES = {
     "halo": "tiling",
     "KV260": "boards",
     "known sensor": "other-sensors",
     "batch handler": "glossary",
 }
-"""What a reader may search for, and the page that must be among the first ten found."""
+"""Words to search for, and the page that must be among the first ten results."""
 FIRST = 10
 LOOK = """
 const report = [];
@@ -101,10 +101,10 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(site: Path, tmp_path: Path) -> Run:
-    """What a script answers in a page of the site."""
+    """Return a function that runs a script in the site and returns the script's answer."""
 
     def answer(script: str, *, dark: bool = False) -> Any:
-        # Every page would load the search index, a megabyte, without searching in it.
+        # Without a search no page needs the search index of a megabyte.
         missing = "search_index.json" if script.startswith(LOOK[:20]) else ""
         return driven(site, script, tmp_path, dark=dark, missing=missing)
 
@@ -117,7 +117,7 @@ def pages(site: Path) -> list[str]:
     )
 
 
-def test_no_page_is_wider_than_its_window_and_every_picture_loads_from_here(
+def test_no_page_is_wider_than_its_window_and_all_files_are_of_the_site(
     site: Path, run: Run
 ) -> None:
     looks = run(LOOK % (json.dumps(pages(site)), json.dumps(WIDTHS_PX)))
@@ -132,12 +132,12 @@ def test_no_page_is_wider_than_its_window_and_every_picture_loads_from_here(
         if look["elsewhere"] and "architecture" not in look["address"]
     ]
     assert elsewhere == [], (
-        "pages ask other places for Mermaid alone, which the published site has: see mkdocs.yml"
+        "only Mermaid may be loaded from elsewhere; the published site has a copy: see mkdocs.yml"
     )
 
 
 @pytest.mark.parametrize(("dark", "scheme"), [(False, "default"), (True, "slate")])
-def test_the_colours_are_those_that_the_reader_prefers(
+def test_the_colours_follow_the_reader_s_preference(
     site: Path, run: Run, dark: bool, scheme: str
 ) -> None:
     some = [page for page in pages(site) if page.count("/") < 2]
@@ -150,8 +150,8 @@ def brightness(colour: str) -> float:
     return sum(float(level) for level in re.findall(r"[\d.]+", colour)[:3])
 
 
-def test_the_search_finds_what_readers_look_for(run: Run) -> None:
-    results = run(SEARCH % json.dumps([*ASKED]))
-    for words, page in ASKED.items():
+def test_the_search_finds_the_expected_pages(run: Run) -> None:
+    results = run(SEARCH % json.dumps([*SEARCHES]))
+    for words, page in SEARCHES.items():
         first = [*dict.fromkeys(urlsplit(address).path for address in results[words])][:FIRST]
         assert any(path.endswith(f"/{page}/") for path in first), (words, first)

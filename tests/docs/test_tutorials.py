@@ -1,5 +1,6 @@
-"""Every command of docs/tutorials, as a reader would type it, and what it shows; each tutorial in
-an empty folder.
+"""Tests that run every command of docs/tutorials as a reader would, and compare its output.
+
+Each tutorial starts in an empty folder.
 """
 
 import re
@@ -19,7 +20,7 @@ PAGES = sorted({path.stem for path in FOLDER.glob("*.md")} - {"index"})
 INSTALLED = "python3 -m venv .venv && .venv/bin/pip install --quiet '.[all]'"
 
 
-def walked(name: str, folder: Path) -> Walk:
+def run_page(name: str, folder: Path) -> Walk:
     walk = Walk(folder)
     walk.page((FOLDER / f"{name}.md").read_text(encoding="utf-8"))
     return walk
@@ -27,8 +28,8 @@ def walked(name: str, folder: Path) -> Walk:
 
 @pytest.mark.parametrize("name", PAGES)
 def test_it_is_set_up_as_the_readme_says(name: str) -> None:
-    """That command is run by .ci/run, in an empty environment; it is the one fence of a tutorial
-    that is not run.
+    """.ci/run runs this command in an empty environment. Only this fence of a tutorial is not run
+    here.
     """
     page = (FOLDER / f"{name}.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
@@ -45,7 +46,7 @@ def test_it_is_set_up_as_the_readme_says(name: str) -> None:
 
 
 def test_restore_an_image(tmp_path: Path) -> None:
-    walked("restore-an-image", tmp_path)
+    run_page("restore-an-image", tmp_path)
     raw = tifffile.imread(tmp_path / "pairs" / "degraded" / "0000-drawn.tif")
     assert raw.max() < 4096
     assert tifffile.imread(tmp_path / "known.tif").shape == raw.shape
@@ -53,18 +54,18 @@ def test_restore_an_image(tmp_path: Path) -> None:
 
 
 def test_your_sensor(tmp_path: Path) -> None:
-    walked("your-sensor", tmp_path)
+    run_page("your-sensor", tmp_path)
     assert (tmp_path / "report" / "report.html").is_file()
     assert tifffile.imread(tmp_path / "network.tif").shape == (256, 256)
 
 
 def test_real_camera(tmp_path: Path, shared_data: Path) -> None:
-    """On the frames that the page names; skipped where they are not at hand."""
+    """The page needs real frames, so the test is skipped without them."""
     for folder in ("frames", "restored/network", "restored/traditional"):
         (tmp_path / folder).mkdir(parents=True)
     for path in sorted((shared_data / "mono16").glob("*.tif")):
         shutil.copy(path, tmp_path / "frames" / path.name.replace("garfield", "IMG"))
-    walked("real-camera", tmp_path)
+    run_page("real-camera", tmp_path)
     assert (
         tifffile.imread(tmp_path / "restored/network/IMG_161122_164605_0126_GRE.tif").dtype
         == "uint16"
@@ -72,7 +73,7 @@ def test_real_camera(tmp_path: Path, shared_data: Path) -> None:
 
 
 def test_your_network(tmp_path: Path) -> None:
-    walked("your-network", tmp_path)
+    run_page("your-network", tmp_path)
     raw, restored = (
         tifffile.imread(tmp_path / name)
         for name in ("pairs/degraded/0000-drawn.tif", "restored.tif")
@@ -82,12 +83,10 @@ def test_your_network(tmp_path: Path) -> None:
 
 
 def test_gate_in_ci(tmp_path: Path) -> None:
-    """Beside the commands: the workflow gives the action inputs that it has, and files that the
-    page made.
-    """
+    """The workflow may only use inputs that the action has, and files that the page wrote."""
     import yaml  # type: ignore[import-untyped]
 
-    walked("gate-in-ci", tmp_path)
+    run_page("gate-in-ci", tmp_path)
     action, workflow = (
         yaml.safe_load(path.read_text(encoding="utf-8"))
         for path in (ROOT / "action.yml", tmp_path / ".github" / "workflows" / "gate.yml")
@@ -102,7 +101,7 @@ def test_gate_in_ci(tmp_path: Path) -> None:
 
 def test_accuracy_and_time(tmp_path: Path) -> None:
     with small_studies():
-        walked("accuracy-and-time", tmp_path)
+        run_page("accuracy-and-time", tmp_path)
     files = {"tradeoff.html", "tradeoff.svg", "tradeoff.json"}
     assert {path.name for path in (tmp_path / "study").iterdir()} == files
     limits = "board latency &lt;= 20 s and board power &lt;= 18 W"

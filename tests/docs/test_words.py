@@ -1,4 +1,4 @@
-"""Names in the code are nouns for values and verbs for functions, in the words of the field."""
+"""Tests that names in the code are not bare participles and not names that were replaced."""
 
 import ast
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 SOURCE = ("profiles", "model", "quant", "deploy")
 PARTICIPLES = {"found", "held", "kept", "looked", "lost", "made", "said", "seen", "told", "wanted"}
-"""They leave out what was found or kept: a reader must look for the noun."""
+"""Such a name leaves out what was found or kept, so that a reader must look for the noun."""
 REPLACED = {
     "Chain": "TraditionalPipeline",
     "Ends": "HostPart",
@@ -25,7 +25,7 @@ REPLACED = {
     "least_px": "min_side_px",
     "quantise": "quantize",
 }
-"""Names that went, and those that replaced them."""
+"""Names that were replaced, and their replacements."""
 
 
 def names_of(tree: ast.AST) -> Iterator[tuple[str, int]]:
@@ -39,7 +39,7 @@ def names_of(tree: ast.AST) -> Iterator[tuple[str, int]]:
 
 
 def unwelcome(name: str) -> bool:
-    """Return True if a name is one of those that went."""
+    """Return True if a name is a bare participle or was replaced."""
     return name.strip("_") in PARTICIPLES or name in REPLACED
 
 
@@ -54,7 +54,7 @@ def test_no_name_is_a_bare_participle_or_one_that_was_replaced() -> None:
     assert bad == []
 
 
-def test_such_names_are_seen_wherever_they_are_defined() -> None:
+def test_such_names_are_found_wherever_they_are_defined() -> None:
     text = "def told(kept): found = kept\nclass Ends: pass\nfor seen in (): pass"
     names = {name for name, _ in names_of(ast.parse(text)) if unwelcome(name)}
     assert names == {"told", "kept", "found", "Ends", "seen"}

@@ -1,23 +1,21 @@
-"""Walks a page as a reader would: writes its files, runs its commands in order, and holds them to
-what it shows.
+"""Follow a page as a reader would: write its files, run its commands and compare their output.
 
-Of a page's fences these count, in order:
+These fences of a page count, in order:
 
-- any with a title, as ```toml title="my-sensor.toml": a file, written as it stands;
-- ```bash: commands, a line each, of the programs known here (`PROGRAMS`), run without a shell (so
-  also on Windows), ours within this process, where all is imported already, but for the first time
-  that each command comes up;
-- ```text: what the commands before it print. Each of its lines must come, in this order; `...`
-  stands for anything, blanks and rules of tables have any length, and a number must be within 2 %,
-  for processors differ.
+- any fence with a title, such as ```toml title="my-sensor.toml": it is written to that file;
+- ```bash: commands of the programs in `PROGRAMS`, one a line. They run without a shell, so also on
+  Windows. Each command of ours starts a process the first time. Later it runs within this process,
+  where all is imported already;
+- ```text: the output of the commands before it. Its lines must be printed in this order. `...`
+  stands for any text, blanks and rules of tables may have any length, and numbers must agree within
+  2 %, because processors differ.
 
-Comments of the page say where a test differs from a reader:
+Comments of the page state where a test differs from a reader:
 
-- `<!-- test: A -> B -->`: from here on commands have B in the place of A, once each at most in a
-  line;
-- `<!-- test: figures vary -->`: of the next output the numbers are another machine's: only their
-  place is compared;
-- `<!-- test: exits 1 -->`: the next commands end with this code, not with 0.
+- `<!-- test: A -> B -->`: B replaces A in all later commands, at most once a line;
+- `<!-- test: figures vary -->`: the numbers of the next output depend on the machine, so only their
+  places are compared;
+- `<!-- test: exits 1 -->`: the next commands end with this exit code instead of 0.
 """
 
 import math
@@ -50,26 +48,27 @@ PART = re.compile(
 NUMBER = re.compile(r"(?<![\w.])-?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 RELATIVE = 0.02
 Done = subprocess.CompletedProcess[str]
-"""A command that ended: its code, and both streams as a terminal shows them."""
+"""A finished command: its exit code, and stdout and stderr as a terminal shows them."""
 STARTED = {"tradeoff"}
-"""Commands that have been started as a shell starts them; a study is small in
-this process alone.
+"""Commands that a test has started in a process of their own.
+
+`tradeoff` always runs within this process, because only here can its study be made small.
 """
 
 
 class PageError(AssertionError):
-    """The page says what does not hold, or what this module does not understand."""
+    """A page states something false, or something that this module does not understand."""
 
 
 @dataclass
 class Walk:
-    """One walk through a page, in a folder of its own.
+    """One run of a page, in a folder of its own.
 
     Attributes:
         folder: where the commands run.
-        printed: what each command printed, by the command as the page has it.
-        shorter: substitutions in force, each with whether a command had it.
-        started: commands that need not be started as a shell starts them, because one walk did.
+        printed: the output of each command, by the command as the page shows it.
+        shorter: the current substitutions, each with whether a command contained it.
+        started: commands that run within this process, because one run has started them already.
     """
 
     folder: Path
@@ -81,11 +80,11 @@ class Walk:
     _last: str = ""
 
     def page(self, text: str) -> None:
-        """Walk through a whole page.
+        """Run a whole page.
 
         Raises:
-            PageError: a command ends with another code, prints something else, or a comment is of
-                no use.
+            PageError: if a command ends with another code or prints something else, or if a comment
+                has no effect.
         """
         for language, title, body, comment in PART.findall(text):
             if comment:
@@ -129,10 +128,10 @@ class Walk:
             self._last += process.stdout
 
     def run(self, command: str) -> Done:
-        """One command with its substitutions.
+        """Run one command with its substitutions.
 
         Raises:
-            PageError: of a program that is not known here.
+            PageError: if the program is not in `PROGRAMS`.
         """
         short = command
         for pair in self.shorter:
@@ -187,25 +186,24 @@ class Walk:
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """A home of its own, and no other program."""
+    """Return variables that name a home of its own, and a PATH without programs."""
     return {"PATH": "", "HOME": str(folder), "USERPROFILE": str(folder)}
 
 
 def plain(text: str) -> list[str]:
-    """The lines that are not empty; blanks and rules of tables have one length."""
+    """Return the lines that are not empty, with blanks and rules of tables of one length."""
     return [
         line for raw in text.splitlines() if (line := re.sub(r"([\s━─])\1*", r"\1", raw.strip()))
     ]
 
 
 def agrees(expected_line: str, printed_line: str, vary: bool) -> bool:
-    """Whether a line of the page is what a command printed: the same words, and numbers that are
-    close.
+    """Return True if a page and a command have the same words and close numbers in a line.
 
     Args:
-        shown: the page's, where `...` stands for anything.
-        found: the command's.
-        vary: numbers may be any.
+        expected_line: the line of the page, where `...` stands for any text.
+        printed_line: the line of the command.
+        vary: whether numbers may differ.
     """
     parts = expected_line.split("...")
     texts = (
