@@ -1,4 +1,4 @@
-"""Labels and detectors that others wrote, as the fuzzer damages them."""
+"""Labels and detectors for the fuzzer to damage, and the functions that read them."""
 
 import shutil
 from collections.abc import Callable
@@ -17,15 +17,15 @@ GREY = np.full((*SIZE_PX, 3), 90, np.uint8)
 
 
 def label_seeds(folder: Path, make: Callable[[Path], Path], suffix: str) -> list[bytes]:
-    """The files of labels in a folder of some layout."""
+    """Return the files of labels in a folder that `make` writes."""
     labels = sorted(
         path for path in make(folder / "made").rglob(f"*{suffix}") if path.stem != "data"
     )
     return [path.read_bytes() for path in labels]
 
 
-def read_beside(path: Path) -> None:
-    """Labels, beside the images that they are of: one file of all, or a copy for each."""
+def read_labels(path: Path) -> None:
+    """Read labels next to their images: one JSON file for all images, or a copy for each image."""
     with TemporaryDirectory() as folder:
         for stem in OBJECTS:
             Image.fromarray(GREY).save(Path(folder) / f"{stem}.png")
@@ -36,7 +36,7 @@ def read_beside(path: Path) -> None:
 
 
 def detector_seeds(folder: Path) -> list[bytes]:
-    """Both layouts, of a fixed size and of any, one with a suppression inside."""
+    """Return detectors of both layouts, of fixed and of any size, one with suppression inside."""
     row = (20.0, 30.0, 40.0, 50.0, 0.5, 0.0)
     kinds = [
         detector(folder / "a.onnx", raw(row)),

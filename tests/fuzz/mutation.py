@@ -1,6 +1,4 @@
-"""Damage to the bytes of a file, and to what its format means by them; all of it drawn from one
-generator.
-"""
+"""Random damage to the bytes of a file, or to the values that its format stores."""
 
 import json
 import struct
@@ -100,18 +98,16 @@ def pick(options: Sequence[T], rng: Rng) -> T:
 
 
 def damaged(content: bytes, others: Sequence[bytes], meaning: Mutate | None, rng: Rng) -> bytes:
-    """A few faults, one after another: of the bytes, or (where the format is known) of what they
-    mean.
-    """
+    """Return content with a few faults in its bytes or, if `meaning` is given, in its values."""
     for _ in range(int(rng.geometric(0.6))):
         if meaning is not None and rng.random() < 0.6:
             content = meaning(content, rng)
         else:
-            content = of_bytes(content, others, rng)
+            content = damage_bytes(content, others, rng)
     return content[: 1 << 18]
 
 
-def of_bytes(content: bytes, others: Sequence[bytes], rng: Rng) -> bytes:
+def damage_bytes(content: bytes, others: Sequence[bytes], rng: Rng) -> bytes:
     """Flip, overwrite, insert, cut out, repeat or cut off bytes, or take some from another file."""
     a, b = sorted(int(rng.integers(0, len(content) + 1)) for _ in range(2))
     b = min(b, a + int(2 ** rng.uniform(0, 10)))
@@ -137,17 +133,17 @@ def of_bytes(content: bytes, others: Sequence[bytes], rng: Rng) -> bytes:
     return pick(choices, rng)
 
 
-def of_json(content: bytes, rng: Rng) -> bytes:
-    """Change one value of a document, or its place; as it was where it is no document any more."""
+def damage_json(content: bytes, rng: Rng) -> bytes:
+    """Change one value of a document or its place. Content that is no JSON is not changed."""
     try:
         return json.dumps(_tree(json.loads(content), rng)).encode("utf-8", "surrogatepass")
     except (ValueError, RecursionError):
         return content
 
 
-def of_xml(content: bytes, rng: Rng) -> bytes:
-    """Change an element's text, name, place or one of its attributes; as it was where it is no XML
-    any more.
+def damage_xml(content: bytes, rng: Rng) -> bytes:
+    """Change the text, name, place or an attribute of an element. Content that is no XML is not
+    changed.
     """
     try:
         root = ET.fromstring(content)  # noqa: S314 - our own seeds, damaged
@@ -165,7 +161,7 @@ def of_xml(content: bytes, rng: Rng) -> bytes:
     if kind < 0.1:
         parent.remove(child)
     elif kind < 0.2:
-        # A copy is appended, because an element within itself would be no tree.
+        # A copy is appended, because an element within itself is no tree.
         parent.append(deepcopy(other))
     elif kind < 0.3:
         child.tag = other.tag
@@ -176,31 +172,31 @@ def of_xml(content: bytes, rng: Rng) -> bytes:
     return bytes(ET.tostring(root))
 
 
-def of_safetensors(content: bytes, rng: Rng) -> bytes:
-    """Change the header, or the JSON within its metadata, and its length with it."""
+def damage_safetensors(content: bytes, rng: Rng) -> bytes:
+    """Change the header or the JSON within its metadata, and adapt the header's length."""
     # A safetensors file begins with the length of its header, 8 bytes little-endian.
     size = int.from_bytes(content[:8], "little")
-    header = of_json(content[8 : 8 + size], rng)
+    header = damage_json(content[8 : 8 + size], rng)
     if rng.random() < 0.5:
         try:
             tree = json.loads(header)
             inner = tree["__metadata__"]
             key = pick(sorted(inner), rng)
-            inner[key] = of_json(inner[key].encode(), rng).decode()
+            inner[key] = damage_json(inner[key].encode(), rng).decode()
             header = json.dumps(tree).encode()
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             pass
     return len(header).to_bytes(8, "little") + header + content[8 + size :]
 
 
-def of_tiff(content: bytes, rng: Rng) -> bytes:
-    """Change tag, type, count or value of an entry of the first directory (classic and
-    little-endian).
+def damage_tiff(content: bytes, rng: Rng) -> bytes:
+    """Change the tag, type, count or value of an entry in the first directory.
+
+    Content that is no classic little-endian TIFF is not changed.
     """
     if content[:4] != b"II*\0" or len(content) < 8:
         return content
-    # Bytes 4 to 7 of a classic TIFF are the place of its first directory, a count and entries of 12
-    # bytes.
+    # Bytes 4 to 7 are the offset of the first directory: a count, and entries of 12 bytes.
     start = int.from_bytes(content[4:8], "little")
     count = int.from_bytes(content[start : start + 2], "little")
     if not 0 < count < 100:
@@ -215,8 +211,8 @@ def of_tiff(content: bytes, rng: Rng) -> bytes:
     return b"".join((content[: at + field], value, content[at + field + width :]))
 
 
-def of_onnx(content: bytes, rng: Rng) -> bytes:
-    """Change one field somewhere in a model; as it was where it is no model any more."""
+def damage_onnx(content: bytes, rng: Rng) -> bytes:
+    """Change one field somewhere in a model. Content that is no model is not changed."""
     model = onnx.ModelProto()
     try:
         model.ParseFromString(content)
@@ -227,7 +223,7 @@ def of_onnx(content: bytes, rng: Rng) -> bytes:
 
 
 def _field(message: Message, rng: Rng) -> None:
-    """Walk down at random, and change what is met at the end."""
+    """Descend at random through a message, and change the last field."""
     fields = [pair for pair in message.ListFields() if rng.random() < 0.8]
     if not fields or rng.random() < 0.05:
         _set(message, pick(message.DESCRIPTOR.fields, rng), rng)
@@ -249,7 +245,7 @@ def _field(message: Message, rng: Rng) -> None:
 
 
 def _set(message: Message, descriptor: Any, rng: Rng) -> None:
-    """A field that was there or not; groups of fields are left empty but present."""
+    """Set a field, whether it was present or not. A message in it is added empty."""
     old = getattr(message, descriptor.name)
     if descriptor.cpp_type == descriptor.CPPTYPE_MESSAGE:
         old.add() if descriptor.is_repeated else old.SetInParent()
@@ -265,14 +261,14 @@ def _like(value: object, rng: Rng) -> object:
         return float(rng.choice((0.0, -1.0, 1e38, np.inf, np.nan, 1e-40)))
     text = pick(TEXTS, rng)
     return (
-        of_bytes(value, [value], rng)
+        damage_bytes(value, [value], rng)
         if isinstance(value, bytes)
         else text.encode("utf-8", "ignore").decode()
     )
 
 
 def _tree(value: object, rng: Rng) -> object:
-    """A document with one value changed, dropped, repeated or wrapped up."""
+    """Return a document with one value changed, dropped, repeated or wrapped in lists."""
     if not isinstance(value, dict | list) or not value or rng.random() >= 0.85:
         return _leaf(value, rng)
     if isinstance(value, dict):
@@ -292,7 +288,7 @@ def _tree(value: object, rng: Rng) -> object:
 
 
 def _leaf(value: object, rng: Rng) -> object:
-    """Something else than a value, or the value within lists."""
+    """Return another value, or the same value within lists."""
     for _ in range(int(rng.choice((1, 40, 400)))):
         value = [value]
     infinite = (1e308, float("nan"), float("inf"), 10**400, 2**63)

@@ -1,4 +1,4 @@
-"""Networks that others wrote, as ONNX and as weights, as the fuzzer damages them."""
+"""Networks for the fuzzer to damage, as ONNX and as weights, and the functions that read them."""
 
 from collections.abc import Callable
 from functools import partial
@@ -34,7 +34,7 @@ SMALL = Variant(1, 2)
 
 
 def onnx_seeds(folder: Path) -> list[bytes]:
-    """The three encodings of a small network, one of them fixed to a tile."""
+    """Return the three encodings of a small network, and its float file fixed to a tile."""
     encodings = (float_convbeers, integer_convbeers, board_convbeers)
     paths = [
         written(partial(encoding, blocks=1, features=2), folder / "a.onnx")
@@ -50,8 +50,8 @@ def onnx_seeds(folder: Path) -> list[bytes]:
 
 
 def exported_seeds(_: Path) -> list[bytes]:
-    """What exporters leave: constants computed, normalisation, padding, other opsets, 16-bit
-    floats.
+    """Return networks like those of exporters: computed constants, normalisation, padding, other
+    opsets, 16-bit floats.
     """
     sizes = CASES["sizes of constants"][0]
     scaled = CASES["normalised and scaled again"][0]
@@ -65,15 +65,15 @@ def exported_seeds(_: Path) -> list[bytes]:
     return [network.SerializeToString() for network in networks]
 
 
-def look_at_onnx(path: Path) -> None:
-    """What `check` does."""
+def check_onnx(path: Path) -> None:
+    """Read a network and place it on a board, as `check` does."""
     place(read_network(path, SIDE_PX), load_dpu("vck190"))
 
 
-def understand_onnx(path: Path) -> None:
-    """What `quantize`, `restore` and `gate` ask of a network before they run it."""
+def analyse_onnx(path: Path) -> None:
+    """Analyse a network as `quantize`, `restore` and `gate` do before they run it."""
     model = load_onnx(path)
-    questions = (
+    analyses = (
         fixed_tile_px,
         tiling_of,
         correction_graph,
@@ -81,20 +81,20 @@ def understand_onnx(path: Path) -> None:
         encoding_faults,
         rounded_tensors,
     )
-    for question in questions:
-        _asked(question, model)
+    for analyse in analyses:
+        _run_analysis(analyse, model)
 
 
-def _asked(question: Callable[[onnx.ModelProto], object], model: onnx.ModelProto) -> None:
+def _run_analysis(analyse: Callable[[onnx.ModelProto], object], model: onnx.ModelProto) -> None:
     try:
-        question(model)
+        analyse(model)
     except BeersError as error:
         if not str(error).isprintable():
             raise ValueError("no sentence") from error
 
 
 def run_onnx(path: Path) -> None:
-    """What `gate` does: the runtime gets the file, fixed to a tile or not."""
+    """Run the file as `gate` does, whether it is fixed to a tile or not."""
     model = load_onnx(path)
     image = np.full((1, 1, SIDE_PX, SIDE_PX), 0.25, np.float32)
     run(open_session(model, 1), image)
@@ -126,6 +126,6 @@ def go_on(path: Path) -> None:
 
 
 def weights_seeds(folder: Path, kind: type[BankedConvBEERS | ConvBEERS] = ConvBEERS) -> list[bytes]:
-    """A network's weights; a banked one is told its sensor."""
+    """Return the weights of a network. A banked network is conditioned on a sensor."""
     save = partial(save_network, network=kind(SMALL), recipe={"degraded": "x"})
     return [written(save, folder / "w.safetensors")]

@@ -1,4 +1,4 @@
-"""Every parser of files that others wrote, with small valid files to damage."""
+"""All parsers of files that users bring, with small valid files to damage."""
 
 import io
 import json
@@ -41,18 +41,25 @@ from tests.fuzz.detection import (
     detect,
     detector_seeds,
     label_seeds,
-    read_beside,
+    read_labels,
 )
-from tests.fuzz.mutation import Mutate, of_json, of_onnx, of_safetensors, of_tiff, of_xml
+from tests.fuzz.mutation import (
+    Mutate,
+    damage_json,
+    damage_onnx,
+    damage_safetensors,
+    damage_tiff,
+    damage_xml,
+)
 from tests.fuzz.networks import (
     SIDE_PX,
+    analyse_onnx,
+    check_onnx,
     checkpoint_seeds,
     exported_seeds,
     go_on,
-    look_at_onnx,
     onnx_seeds,
     run_onnx,
-    understand_onnx,
     weights_seeds,
 )
 from tests.fuzz.pictures import (
@@ -81,12 +88,12 @@ class Parser:
     """A way into the program.
 
     Attributes:
-        name: in lists.
-        suffix: of its files.
-        seeds: makes small valid files, given a folder to work in.
-        parse: reads a file, and touches what it says.
-        meaning: damage that knows the format; None where bytes are all there is.
-        share: of the executions; dear parsers have less.
+        name: the name in lists of tests, from which the damage is seeded.
+        suffix: the suffix of its files.
+        seeds: writes small valid files into a folder, and returns their bytes.
+        parse: reads a file and uses its values.
+        meaning: damages the values of the format; None if only bytes are damaged.
+        share: the share of the executions, which is less for slow parsers.
     """
 
     name: str
@@ -125,7 +132,7 @@ def read_point(path: Path) -> object:
 
 
 def recipe_seeds(folder: Path) -> list[bytes]:
-    """The sensors of a folder of pairs, with a table and with a point-spread function."""
+    """Return a recipe of pairs whose sensors have an MTF table and a point-spread function."""
     path = folder / "a.toml"
     path.write_bytes(described_seeds(folder)[0])
     profile = Sensor.load(str(path))
@@ -203,12 +210,12 @@ def manifest_seeds(_: Path) -> list[bytes]:
 
 
 def read_manifest(path: Path) -> None:
-    """The lines by which a dataset is continued."""
+    """Read the lines by which a dataset is continued."""
     matching_lines(path.parent, [path])
 
 
 def board_of(path: Path) -> None:
-    """A target of the user's, and a network placed on it and timed."""
+    """Load a user's target, place a network on it, and predict its time."""
     TargetProfile.load(str(path))
     dpu = load_dpu(str(path))
     Layers.of(count_work(place(_network(), dpu).core, dpu), dpu)
@@ -229,23 +236,25 @@ GDAL = {"VRT": "a.vrt", "DIMAP": "DIM.XML", "JPEG 2000": "a.jp2", "NITF": "a.ntf
 XML = ("VRT", "DIMAP")
 
 
-def of_gdal(kind: str, name: str) -> Parser:
-    """What GDAL reads, with the tiles that an index names beside it."""
+def gdal_parser(kind: str, name: str) -> Parser:
+    """Return the parser of a format of GDAL. An index is read with the tiles that it names."""
     seeds = partial(gdal_seeds, name=name)
     reader = partial(read_with_tiles, name=name)
-    return Parser(kind, Path(name).suffix.lower(), seeds, reader, of_xml if kind in XML else None)
+    return Parser(
+        kind, Path(name).suffix.lower(), seeds, reader, damage_xml if kind in XML else None
+    )
 
 
 PARSERS: tuple[Parser, ...] = (
-    Parser("ONNX, looked at", ".onnx", onnx_seeds, look_at_onnx, of_onnx),
-    Parser("ONNX, folded", ".onnx", exported_seeds, look_at_onnx, of_onnx),
-    Parser("ONNX, understood", ".onnx", onnx_seeds, understand_onnx, of_onnx),
-    Parser("ONNX, run", ".onnx", onnx_seeds, run_onnx, of_onnx, 0.3),
-    Parser("TIFF, whole", ".tif", tiff_seeds, read_pixels, of_tiff),
-    Parser("TIFF, by rows", ".tif", tiff_seeds, read_rows, of_tiff),
+    Parser("ONNX, looked at", ".onnx", onnx_seeds, check_onnx, damage_onnx),
+    Parser("ONNX, folded", ".onnx", exported_seeds, check_onnx, damage_onnx),
+    Parser("ONNX, understood", ".onnx", onnx_seeds, analyse_onnx, damage_onnx),
+    Parser("ONNX, run", ".onnx", onnx_seeds, run_onnx, damage_onnx, 0.3),
+    Parser("TIFF, whole", ".tif", tiff_seeds, read_pixels, damage_tiff),
+    Parser("TIFF, by rows", ".tif", tiff_seeds, read_rows, damage_tiff),
     Parser("PNG", ".png", lambda _: [image_of({"format": "PNG"})], read_pixels),
     Parser("JPEG", ".jpg", lambda _: [image_of({"format": "JPEG"})], read_pixels),
-    *(of_gdal(kind, name) for kind, name in GDAL.items()),
+    *(gdal_parser(kind, name) for kind, name in GDAL.items()),
     Parser(
         "sensor TOML", ".toml", lambda _: _files("sensors"), lambda p: Sensor.load(str(p)).nominal()
     ),
@@ -253,48 +262,52 @@ PARSERS: tuple[Parser, ...] = (
         "sensor TOML, MTF table", ".toml", described_seeds, lambda p: Sensor.load(str(p)).nominal()
     ),
     Parser("point spread, npy", ".npy", point_seeds, read_point),
-    Parser("recipe of pairs", ".json", recipe_seeds, read_recipe, of_json),
+    Parser("recipe of pairs", ".json", recipe_seeds, read_recipe, damage_json),
     Parser("scene TOML", ".toml", lambda _: _files("scenes"), lambda p: SceneCall.load(str(p))),
     Parser("target TOML", ".toml", lambda _: _files("targets"), board_of, share=0.3),
     Parser("gate limits TOML", ".toml", lambda _: LIMITS, limits_of),
     Parser(
-        "gate baseline JSON", ".json", document_seeds, lambda p: read_baseline(p, GATED), of_json
+        "gate baseline JSON",
+        ".json",
+        document_seeds,
+        lambda p: read_baseline(p, GATED),
+        damage_json,
     ),
     Parser(
         "board's runs JSON",
         ".json",
         runs_seeds,
         lambda p: read_own_runs(p, load_dpu("vck190")),
-        of_json,
+        damage_json,
         0.3,
     ),
-    Parser("journal of a run", ".json", journal_seeds, resume, of_json, 0.5),
-    Parser("dataset manifest", ".jsonl", manifest_seeds, read_manifest, of_json),
+    Parser("journal of a run", ".json", journal_seeds, resume, damage_json, 0.5),
+    Parser("dataset manifest", ".jsonl", manifest_seeds, read_manifest, damage_json),
     Parser(
         "training log", ".csv", lambda _: [b"step,loss\n10,0.5\n20,0.25\n"], log_lines, share=0.5
     ),
-    Parser("weights", ".safetensors", weights_seeds, load_network, of_safetensors),
+    Parser("weights", ".safetensors", weights_seeds, load_network, damage_safetensors),
     Parser(
         "told weights",
         ".safetensors",
         partial(weights_seeds, kind=BankedConvBEERS),
         load_network,
-        of_safetensors,
+        damage_safetensors,
     ),
-    Parser("checkpoint", ".safetensors", checkpoint_seeds, go_on, of_safetensors),
+    Parser("checkpoint", ".safetensors", checkpoint_seeds, go_on, damage_safetensors),
     Parser(
         "backbone npz",
         ".npz",
         partial(backbone_seeds, packed=True),
         lambda p: read_tensors(p, ["a", "b"]),
     ),
-    Parser("labels of VOC", ".xml", partial(label_seeds, make=voc, suffix=".xml"), read_beside),
+    Parser("labels of VOC", ".xml", partial(label_seeds, make=voc, suffix=".xml"), read_labels),
     Parser(
         "labels of COCO",
         ".json",
         partial(label_seeds, make=coco, suffix=".json"),
-        read_beside,
-        of_json,
+        read_labels,
+        damage_json,
     ),
-    Parser("detector", ".onnx", detector_seeds, detect, of_onnx, 0.5),
+    Parser("detector", ".onnx", detector_seeds, detect, damage_onnx, 0.5),
 )

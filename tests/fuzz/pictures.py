@@ -1,4 +1,4 @@
-"""Images that others wrote, and the indexes that make one of many, as the fuzzer damages them."""
+"""Images and mosaics for the fuzzer to damage, and the functions that read them."""
 
 import io
 import shutil
@@ -15,14 +15,14 @@ from beers_deploy.model.raster.reader import open_raster
 
 
 def written(make: Callable[[Path], object], path: Path) -> bytes:
-    """The bytes of a file that `make` writes."""
+    """Return the bytes of a file that `make` writes."""
     make(path)
     return path.read_bytes()
 
 
 def tiff_seeds(folder: Path) -> list[bytes]:
-    """Strips and tiles, packed or not, bands in planes or mixed, pages, tags of geography, every
-    byte order.
+    """Return TIFFs with strips and tiles, compressed or not, with bands in planes or interleaved,
+    with pages, geographic tags and both byte orders.
     """
     rng = np.random.default_rng(0)
     grey = rng.integers(0, 4096, (17, 19)).astype(np.uint16)
@@ -62,7 +62,7 @@ def image_of(options: dict[str, str]) -> bytes:
 
 
 def read_rows(path: Path) -> None:
-    """What `restore` reads: bands of rows, a large image only in part."""
+    """Read rows as `restore` does, but only the first ones and none of a very wide image."""
     with open_raster(path) as source:
         raster = source.raster
         if raster.bands * raster.width_px * min(raster.height_px, 64) < 1 << 24:
@@ -77,9 +77,7 @@ def gdal_seeds(_: Path, name: str) -> list[bytes]:
 
 @cache
 def _with_tiles(name: str) -> dict[str, bytes]:
-    """An image, or an index and what it names, by their names; a test is skipped where rasterio is
-    not installed.
-    """
+    """Return the bytes of an image, or of an index and its tiles, by file name."""
     from tests.model.raster import formats as images
 
     with TemporaryDirectory() as folder:
@@ -88,7 +86,7 @@ def _with_tiles(name: str) -> dict[str, bytes]:
 
 
 def read_with_tiles(path: Path, name: str) -> None:
-    """An image, or an index beside sound tiles, by rows."""
+    """Read the rows of an image, or of an index next to undamaged tiles."""
     with TemporaryDirectory() as folder:
         for tile, content in _with_tiles(name).items():
             (Path(folder) / tile).write_bytes(content)

@@ -1,8 +1,8 @@
-"""Each parser on files damaged by a fixed seed, and on arbitrary bytes: read, or refused by a
-sentence.
+"""Tests that each parser reads a damaged file, or refuses it with one sentence.
 
-`BEERS_FUZZ=1000 pytest tests/fuzz` damages a thousand times as many files, with BEERS_FUZZ_SEED=1
-others. What a test fails on is left in its temporary folder.
+Files are damaged by a fixed seed, or are arbitrary bytes. `BEERS_FUZZ=1000 pytest tests/fuzz`
+damages a thousand times as many files, and BEERS_FUZZ_SEED=1 other ones. A file for which a test
+fails stays in its temporary folder.
 """
 
 import os
@@ -29,19 +29,20 @@ ARBITRARY = 15
 SEED = int(os.environ.get("BEERS_FUZZ_SEED", "0"))
 CPU_S = 5.0
 FREE_BYTES = 1 << 28
-"""What the machine seems to have free: parsers that ask may take much of it."""
+"""The free memory that parsers see. Those that ask may use much of it."""
 
 BY_NAME = pytest.mark.parametrize("parser", PARSERS, ids=lambda parser: parser.name)
 
 
 class TooLongError(BaseException):
-    """Raised by the timer; a BaseException, so that no parser takes it for a fault of the file."""
+    """Raised by the timer. No parser takes a BaseException for a fault of the file."""
 
 
 @contextmanager
 def limited_time() -> Iterator[None]:
-    """By the process's own time, so that a busy machine makes no finding; Windows has no such
-    timer.
+    """Limit the process's CPU time, so that a busy machine causes no failure.
+
+    Windows has no such timer.
     """
 
     def ring(*_: object) -> None:
@@ -61,8 +62,9 @@ def limited_time() -> Iterator[None]:
 
 
 def is_read(parser: Parser, content: bytes, folder: Path) -> bool:
-    """Whether a file is read; refused by anything but a sentence, or with another file beside it,
-    the test fails.
+    """Return True if a file is read, and False if it is refused with a sentence.
+
+    The test fails on any other error, and if the parser changes the folder.
     """
     path = folder / "in" / f"file{parser.suffix}"
     path.parent.mkdir(exist_ok=True)
@@ -91,7 +93,7 @@ def seeds(parser: Parser, tmp_path_factory: pytest.TempPathFactory) -> list[byte
 
 
 @BY_NAME
-def test_damaged_files_are_read_or_refused_by_a_sentence(
+def test_damaged_files_are_read_or_refused_with_a_sentence(
     parser: Parser, seeds: list[bytes], tmp_path: Path
 ) -> None:
     assert True in {is_read(parser, content, tmp_path) for content in seeds}
@@ -102,7 +104,7 @@ def test_damaged_files_are_read_or_refused_by_a_sentence(
 
 
 @BY_NAME
-def test_arbitrary_bytes_are_refused_by_a_sentence(
+def test_arbitrary_bytes_are_read_or_refused_with_a_sentence(
     parser: Parser, seeds: list[bytes], tmp_path: Path
 ) -> None:
     @settings(max_examples=ARBITRARY, derandomize=True, database=None)

@@ -1,4 +1,4 @@
-"""What the Dockerfile promises: pinned bases, packages by hash, named folders, no root."""
+"""Tests of the Dockerfile: pinned bases, packages by hash, named folders, no root."""
 
 import json
 import re
@@ -9,18 +9,18 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 PINNED = re.compile(r"[\w./-]+:\d+\.\d+\.\d+[\w.-]*@sha256:[0-9a-f]{64}")
 FETCHES = re.compile(r"\b(curl|wget|git clone)\b|https?://")
-SOUND_INSTALL = re.compile(r"--require-hashes|--no-index|install( --[\w-]+)* [\w-]+==[\d.]+$")
+PINNED_INSTALL = re.compile(r"--require-hashes|--no-index|install( --[\w-]+)* [\w-]+==[\d.]+$")
 
 
 def arguments_of(*words: str) -> list[str]:
-    """The arguments of these instructions; comments left out, continued lines joined."""
+    """Return the arguments of these instructions, with continued lines joined."""
     text = re.sub(r"(?m)^\s*#.*\n", "", (ROOT / "Dockerfile").read_text()).replace("\\\n", " ")
     parts = [line.strip().partition(" ") for line in text.splitlines()]
     return [rest for word, _, rest in parts if word.upper() in words]
 
 
 def copied() -> set[str]:
-    """What is copied into the image from the repository."""
+    """Return the paths that are copied from the repository into the image."""
     sources = set[str]()
     for copy in arguments_of("COPY"):
         if not copy.startswith("--"):
@@ -37,13 +37,13 @@ def test_bases_are_pinned_packages_hashed_and_root_is_not_used() -> None:
     assert arguments_of("ADD") == [command for command in commands if FETCHES.search(command)] == []
     assert not {".", "/", "*"} & copied()
     steps = chain.from_iterable(command.split("&&") for command in commands)
-    assert all(SOUND_INSTALL.search(step.strip()) for step in steps if "pip install" in step)
+    assert all(PINNED_INSTALL.search(step.strip()) for step in steps if "pip install" in step)
 
 
 def test_every_folder_of_the_package_reaches_the_image() -> None:
     lines = (ROOT / ".dockerignore").read_text().splitlines()
-    let_in = {line[1:] for line in lines if line.startswith("!")}
-    assert {"setup.py", "profiles", "model", "quant", "deploy"} <= copied() <= let_in
+    allowed = {line[1:] for line in lines if line.startswith("!")}
+    assert {"setup.py", "profiles", "model", "quant", "deploy"} <= copied() <= allowed
     assert all((ROOT / name).exists() for name in copied())
 
 

@@ -1,6 +1,4 @@
-"""The locks hold what pyproject.toml asks for, each version once, by its hashes; the core's is part
-of the other.
-"""
+"""Tests that the locks satisfy pyproject.toml, and that the core's lock is part of the other."""
 
 import re
 import tomllib
@@ -17,7 +15,7 @@ PIN = re.compile(
 PINNED = re.compile(r"(?m)^[\w.-]+==[\w.!]+")
 
 
-def asked_for(*extras: str) -> list[str]:
+def requirements_of(*extras: str) -> list[str]:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     requirements = []
     for extra in extras:
@@ -30,7 +28,7 @@ def asked_for(*extras: str) -> list[str]:
 
 
 def faults(lock: str, requirements: list[str]) -> list[str]:
-    """What is wrong with a lock, a sentence each."""
+    """Return the faults of a lock, one sentence each."""
     lines = [
         line
         for line in re.sub(r"\s*\\\n\s*", " ", lock).splitlines()
@@ -47,7 +45,7 @@ def faults(lock: str, requirements: list[str]) -> list[str]:
     for requirement in map(Requirement, requirements):
         version = pins.get(canonicalize_name(requirement.name))
         if version is None or not requirement.specifier.contains(version, prereleases=True):
-            sentences.append(f"{requirement} is asked for, {version} is locked")
+            sentences.append(f"{requirement} is required, but {version} is locked")
     return sentences
 
 
@@ -55,7 +53,7 @@ def test_the_locks_satisfy_the_project() -> None:
     full, core = (
         (ROOT / name).read_text() for name in ("requirements.lock", "requirements-core.lock")
     )
-    assert faults(full, asked_for("study", "torch")) == []
-    assert faults(core, asked_for()) == []
+    assert faults(full, requirements_of("study", "torch")) == []
+    assert faults(core, requirements_of()) == []
     assert set(PINNED.findall(core)) < set(PINNED.findall(full))
     assert "torch==" not in core

@@ -1,6 +1,4 @@
-"""What is said of systems, in pyproject.toml, workflows and pages, is one thing; and no module
-needs one of them.
-"""
+"""Tests that pages and workflows name the same systems, and that no module needs one of them."""
 
 import ast
 import re
@@ -32,7 +30,7 @@ def pages() -> list[Path]:
     return [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob(".github/workflows/*.yml")]
 
 
-def test_every_page_installs_a_torch_that_the_project_keeps() -> None:
+def test_every_page_installs_the_same_torch() -> None:
     versions = {page.name: TORCH.findall(page.read_text(encoding="utf-8")) for page in pages()}
     assert versions["README.md"] == versions["CONTRIBUTING.md"] == ["<2.14"]
     assert {*chain.from_iterable(versions.values())} == {"<2.14"}
@@ -52,9 +50,7 @@ def test_the_workflow_and_its_page_name_the_same_systems() -> None:
 
 
 def bound_to_a_system(source: str) -> list[str]:
-    """What a module imports on opening that only some systems have, and text files that it opens in
-    whatever code.
-    """
+    """Return a module's imports that only some systems have, and its calls without an encoding."""
     tree = ast.parse(source)
     imports = [node for node in tree.body if isinstance(node, ast.Import)]
     imported = [alias.name for alias in chain.from_iterable(node.names for node in imports)]
@@ -64,16 +60,16 @@ def bound_to_a_system(source: str) -> list[str]:
         for node in ast.walk(tree)
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)
     ]
-    unsaid = [
+    without_encoding = [
         ast.unparse(call)
         for call in calls
         if isinstance(call.func, ast.Attribute) and call.func.attr in ("read_text", "write_text")
         if not any(keyword.arg == "encoding" for keyword in call.keywords)
     ]
-    return [name for name in imported if name.partition(".")[0] in OF_ONE_SYSTEM] + unsaid
+    return [name for name in imported if name.partition(".")[0] in OF_ONE_SYSTEM] + without_encoding
 
 
-def test_every_module_opens_on_every_system_and_says_its_encodings() -> None:
+def test_every_module_imports_on_every_system_and_names_its_encodings() -> None:
     modules = list(chain.from_iterable((ROOT / package).rglob("*.py") for package in PACKAGES))
     bindings = {path: bound_to_a_system(path.read_text(encoding="utf-8")) for path in modules}
     assert len(modules) > 100

@@ -49,8 +49,7 @@ def lowest_versions() -> list[str]:
 
 
 def pip(python: Path, *words: object) -> subprocess.CompletedProcess[str]:
-    # Bytecode is compiled where it is imported: to compile all of SciPy takes longer than to
-    # install it.
+    # To compile the bytecode of all of SciPy takes longer than to install it.
     options = ("--quiet", "--disable-pip-version-check", "--no-compile", *map(str, words))
     return subprocess.run(
         [python, "-m", "pip", "install", *options], capture_output=True, text=True, check=False
@@ -58,7 +57,7 @@ def pip(python: Path, *words: object) -> subprocess.CompletedProcess[str]:
 
 
 def copied_project(folder: Path) -> Path:
-    """Copy what is packed: building in the repository would leave files there."""
+    """Copy the files of the package, because a build in the repository would leave files there."""
     for name in PROJECT:
         source = ROOT / name
         if source.is_dir():
@@ -87,7 +86,7 @@ def lowest(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A raw image, a scene, a small network and samples for it."""
+    """Return a folder with a raw image, a scene, a small network and samples for it."""
     rng = np.random.default_rng(0)
     for name, side_px in (("raw.tif", SIDE_PX), ("scene.tif", SCENE_PX)):
         tifffile.imwrite(
@@ -98,16 +97,15 @@ def folder(tmp_path: Path) -> Path:
         rng.uniform(0, 1, (SAMPLES, 1, SIDE_PX, SIDE_PX)).astype(np.float32),
     )
     sketch = Sketch(channels=1)
-    features = sketch.node("Relu", weighted(sketch, rng, "image", 8, 1))
+    features = sketch.node("Relu", conv(sketch, rng, "image", 8, 1))
     sketch.save(
-        tmp_path / "float.onnx", sketch.node("Add", "image", weighted(sketch, rng, features, 1, 8))
+        tmp_path / "float.onnx",
+        sketch.node("Add", "image", conv(sketch, rng, features, 1, 8)),
     )
     return tmp_path
 
 
-def weighted(
-    sketch: Sketch, rng: np.random.Generator, source: str, outputs: int, inputs: int
-) -> str:
+def conv(sketch: Sketch, rng: np.random.Generator, source: str, outputs: int, inputs: int) -> str:
     weight = sketch.constant(rng.normal(0, 0.1, (outputs, inputs, 3, 3)).astype(np.float32))
     return sketch.node("Conv", source, weight, pads=[1] * 4)
 
