@@ -2,7 +2,6 @@
 
 import re
 import shutil
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,7 @@ from tests.deploy.studies.detection.networks import detector, raw
 from tests.docs.how_to import STARTED
 from tests.docs.walk import ROOT, Walk
 from tests.model.networks import plain
+from tests.model.raster import formats as images
 
 HOW_TO = ROOT / "docs" / "how-to"
 SITES = 6
@@ -44,8 +44,7 @@ def prepare(folder: Path) -> None:
     faulty_frames(folder)
     networks(folder)
     labelled_pictures(folder)
-    if find_spec("rasterio"):
-        other_formats(folder)
+    other_formats(folder)
     walk = Walk(folder, started=STARTED)
     for command in COMMANDS.split("\n")[1:-1]:
         process = walk.run(command)
@@ -124,8 +123,6 @@ def labelled_pictures(folder: Path) -> None:
 
 def other_formats(folder: Path) -> None:
     """Write images in formats that GDAL reads."""
-    from tests.model.raster import formats as images
-
     pixels = images.digital_numbers(bands=1)
     images.write_jp2(folder / "raw.jp2", pixels, NBITS=12)
     images.write_vrt(folder / "mosaic.vrt", pixels)

@@ -12,6 +12,7 @@ import tifffile
 from PIL import Image
 
 from beers_deploy.model.raster.reader import open_raster
+from tests.model.raster import formats as images
 
 
 def written(make: Callable[[Path], object], path: Path) -> bytes:
@@ -78,8 +79,6 @@ def gdal_seeds(_: Path, name: str) -> list[bytes]:
 @cache
 def _with_tiles(name: str) -> dict[str, bytes]:
     """Return the bytes of an image, or of an index and its tiles, by file name."""
-    from tests.model.raster import formats as images
-
     with TemporaryDirectory() as folder:
         images.FORMATS[name](Path(folder) / name, images.digital_numbers())
         return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
