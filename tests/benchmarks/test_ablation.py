@@ -1,4 +1,4 @@
-"""The ablation runs, and shows what a pass buys."""
+"""Test that the ablation runs and shows the gain of each pass."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The profiles hold what the scripts find, and the published networks are what they are called."""
+"""Tests of the cost model's fit, and of our descriptions of the published networks."""
 
 import math
 
@@ -20,21 +20,21 @@ from benchmarks.cost_model.published import (
 )
 from benchmarks.cost_model.validation import SHARE, tolerance_rank
 
-# Parameters without biases and batch norms, from the papers or their repositories.
+# Numbers of parameters, from the papers or their repositories, without biases and batch norms.
 WEIGHTS = {"resnet-18": 11.68e6, "vgg-16": 138.34e6, "inception v3": 23.80e6, "yolo v5 n": 1.86e6}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("board", boards())
-def test_the_profile_holds_what_the_fit_finds(board: str) -> None:
+def test_the_profile_has_the_constants_of_the_fit(board: str) -> None:
     dpu = load_dpu(board)
     assert rounded(fit(Cases(published_cases(board), Structure.of(dpu)))) == Constants.of(dpu)
 
 
 @pytest.mark.slow
 def test_every_network_is_the_published_one_and_passes_the_rules_of_its_boards() -> None:
-    """AMD compiled them for these boards: a rule that refuses one is wrong, or it is written down
-    wrongly.
+    """AMD compiled them for these boards. If a rule refuses one, the rule or our description of
+    the network is wrong.
     """
     for name, entry in NETWORKS.items():
         net = written(name).network
@@ -82,9 +82,9 @@ def test_the_papers_network_is_in_no_fit() -> None:
 
 
 @pytest.mark.parametrize("count", [3, 14, 30, 57])
-def test_the_rank_of_a_tolerance_is_the_least_that_is_sure_enough(count: int) -> None:
+def test_the_rank_of_a_tolerance_is_the_smallest_that_is_sure_enough(count: int) -> None:
     def sure(rank: int) -> float:
-        """That fewer than `rank` of the draws fall among SHARE."""
+        """Return the probability that fewer than `rank` of the draws fall among SHARE."""
         return math.fsum(
             math.comb(count, k) * SHARE**k * (1 - SHARE) ** (count - k) for k in range(rank)
         )

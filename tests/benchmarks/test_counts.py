@@ -33,7 +33,7 @@ def test_what_is_counted() -> None:
 
 
 @pytest.mark.parametrize("limit", [0.0, 1.0])
-def test_a_limit_that_is_passed_is_told(monkeypatch: pytest.MonkeyPatch, limit: float) -> None:
+def test_an_exceeded_limit_is_reported(monkeypatch: pytest.MonkeyPatch, limit: float) -> None:
     totals = dict.fromkeys(counts.PARTS, counts.counted(("benchmarks/detector",)))
     monkeypatch.setattr(counts, "DENSITY_LIMITS", {"source": limit})
     monkeypatch.setattr(counts, "PACKED", {})
@@ -42,7 +42,7 @@ def test_a_limit_that_is_passed_is_told(monkeypatch: pytest.MonkeyPatch, limit: 
 
 
 @pytest.mark.parametrize("field", counts.PACKED)
-def test_packed_code_is_named_in_every_part(field: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_packed_code_is_reported_in_any_part(field: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(counts, "DENSITY_LIMITS", {})
     clean = counts.counted(("benchmarks/detector",))
     packed = clean._replace(**{field: 2})

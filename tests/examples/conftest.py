@@ -7,5 +7,5 @@ from beers_deploy.model.simulator.sampling import Scene
 
 @pytest.fixture(scope="session")
 def scenes() -> list[Scene]:
-    """A drawn scene to learn from."""
+    """Return a drawn scene for training."""
     return [procedural_scene(720, 720, np.random.default_rng(0))]

@@ -1,6 +1,4 @@
-"""Networks as users bring them: what torch exports of them computes the same, at every size that is
-legal.
-"""
+"""Tests that the example networks compute the same in ONNX as in torch, at all legal sizes."""
 
 from collections import Counter
 
@@ -16,12 +14,12 @@ from examples.networks import NETWORKS, build, to_onnx
 MAX_DIFFERENCE = 1e-5
 
 
-def made(name: str, seed: int = 0) -> nn.Module:
+def seeded_network(name: str, seed: int = 0) -> nn.Module:
     return build(name, torch.Generator().manual_seed(seed))
 
 
 def shapes(name: str) -> list[tuple[int, int, int, int]]:
-    """Odd and even sizes in steps of the network's own."""
+    """Return odd and even multiples of the network's step."""
     example = NETWORKS[name]
     step = example.multiple_px
     return [(1, example.inputs, 9 * step, 10 * step), (2, example.inputs, 12 * step, 7 * step)]
@@ -44,13 +42,13 @@ def differences(
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_the_exported_network_equals_torch_at_odd_and_even_sizes(name: str) -> None:
-    network = made(name)
+    network = seeded_network(name)
     assert max(differences(network, to_onnx(name, network), shapes(name))) <= MAX_DIFFERENCE
 
 
 @pytest.mark.parametrize("name", ["dncnn", "mobile"])
 def test_batch_normalisation_may_stay_unfolded_and_is_not_the_identity(name: str) -> None:
-    network = made(name)
+    network = seeded_network(name)
     model = to_onnx(name, network, fold=False)
     assert Counter(node.op_type for node in model.graph.node)["BatchNormalization"] == sum(
         isinstance(module, nn.BatchNorm2d) for module in network.modules()

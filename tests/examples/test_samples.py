@@ -1,6 +1,4 @@
-"""What the example networks learn from: what each is for, the same for the same seed, as
-`--samples` reads it.
-"""
+"""Tests of the training data of the example networks, and of the files that `--samples` reads."""
 
 from pathlib import Path
 
@@ -16,9 +14,7 @@ from examples.train_network import criterion
 
 # There is one network for each kind of batch. The other networks read what the first one reads.
 @pytest.mark.parametrize("name", ["dncnn", "espcn", "edsr4", "segment"])
-def test_batches_fit_the_network_and_come_again_with_the_seed(
-    name: str, scenes: list[Scene]
-) -> None:
+def test_batches_fit_the_network_and_repeat_with_the_seed(name: str, scenes: list[Scene]) -> None:
     (image, reference), (repeated, _), (other, _) = (
         next(batches(name, scenes, seed)) for seed in (0, 0, 1)
     )
@@ -32,7 +28,7 @@ def test_batches_fit_the_network_and_come_again_with_the_seed(
 
 
 @pytest.mark.parametrize("name", ["espcn", "segment"])
-def test_a_file_of_samples_is_read_as_data(
+def test_a_file_of_samples_can_be_read(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "samples.npz"

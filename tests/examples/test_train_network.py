@@ -1,4 +1,4 @@
-"""Training of the example networks: a few steps already help, and both files hold what came out."""
+"""Tests that a few training steps help, and that both files contain the trained network."""
 
 from itertools import islice
 from pathlib import Path

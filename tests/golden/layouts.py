@@ -54,7 +54,7 @@ def scene() -> np.ndarray:
 
 
 def bands_of(name: str) -> list[np.ndarray]:
-    """Return the planes of a layout: the scene, and what the layout is about."""
+    """Return the planes of a layout: the scene, and the property that the layout tests."""
     image = scene()
     if name in ("nodata", "float with nan"):
         image = image.astype(np.float32) if name == "float with nan" else image
@@ -88,7 +88,7 @@ def written(name: str, folder: Path) -> Path:
 
 
 def describe(file: Any, name: str) -> None:
-    """Add the metadata that a layout is about to a file that is being written."""
+    """Add the metadata that a layout tests to a file that is being written."""
     if name == "internal mask":
         known = np.full((HEIGHT_PX, WIDTH_PX), 255, np.uint8)
         known[30:35, 50:58] = 0
@@ -148,9 +148,9 @@ def restored(name: str, network: str, folder: Path) -> Mapping[str, object]:
     """Restore a layout by INT8, and return what GDAL reads of the result, or the error.
 
     Args:
-        name: of the layout.
+        name: the name of the layout.
         network: the file of an INT8 network.
-        folder: where files are written.
+        folder: the folder for all files.
     """
     image = written(name, folder)
     out = folder / f"{name}, restored.tif"

@@ -1,6 +1,6 @@
 """The results of the verbs for some networks, images, raster layouts and wrong calls.
 
-Their form is small to store and to compare.
+They are reduced to a form that is small to store and to compare.
 
     PYTHONPATH=. python tests/golden/outputs.py
 

@@ -1,9 +1,9 @@
-"""The small networks of `benchmarks/small_networks.py`, and the integers that they become.
+"""The small networks of `benchmarks/small_networks.py`, and their INT8 files.
 
     PYTHONPATH=. python tests/golden/small_networks.py
 
-trains them briefly and writes their weights to `small_networks.safetensors`, in 16 bits: trained on
-another processor they would be other networks, and so would their integers.
+trains them briefly and writes their weights to `small_networks.safetensors`, in 16 bits. They are
+stored because training on another processor gives other weights, and so other integers.
 """
 
 import sys
@@ -20,7 +20,7 @@ WEIGHTS = Path(__file__).with_suffix(".safetensors")
 STEPS = 30
 SIDE_PX = 32
 SAMPLES = 2
-"""That each network is calibrated on: few and small, so that all take half a minute."""
+"""Number of calibration samples: few and small, so that all networks take half a minute."""
 
 
 def save_weights() -> None:
@@ -34,7 +34,7 @@ def save_weights() -> None:
 
 
 def quantized(name: str, folder: Path) -> Path:
-    """Quantise the network of that name; the INT8 file."""
+    """Quantize the network of that name, and return the INT8 file."""
     kind, make = NETWORKS[name]
     prefix = f"{slug(name)}."
     tensors = {

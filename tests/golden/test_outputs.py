@@ -1,4 +1,4 @@
-"""What users see does not change: see `outputs.py`, which writes the stored outputs."""
+"""Tests that the outputs that users see do not change. `outputs.py` writes the stored ones."""
 
 import json
 from typing import Any
@@ -24,21 +24,22 @@ def stored(part: str) -> dict[str, Any]:
 
 
 def close(name: str, array: np.ndarray, expected: np.ndarray) -> bool:
-    """Return True if an array that is fitted here is the stored one but for float sums, which
-    differ in their last bits between processors.
+    """Return True if an array that is fitted here equals the stored one up to float sums.
+
+    Their last bits differ between processors.
     """
     if "float32," in name:
         return bool(np.allclose(array, expected, rtol=0, atol=1.01, equal_nan=True))
     if "int8," in name:
         return bool(np.nanmean(np.abs(array.astype(float) - expected)) <= 2)
     difference = np.abs(array - expected)
-    # A bias lies between two that its shift allows: one of eight may go to the other. Its image is
-    # compared as well.
+    # A bias is rounded to one of two values that its shift allows, so one of eight may differ. The
+    # restored image is compared as well.
     spared = difference.max() if name.endswith("biases") else 0
     return bool(difference.sum() - spared <= 0.01 * np.abs(expected).sum())
 
 
-def test_images_and_integers_are_those_that_were_stored(current: Outputs) -> None:
+def test_images_and_integers_equal_the_stored_ones(current: Outputs) -> None:
     with np.load(STORED.with_suffix(".npz")) as stored_arrays:
         arrays = dict(stored_arrays)
     assert current.arrays.keys() == arrays.keys()
@@ -52,7 +53,7 @@ def test_images_and_integers_are_those_that_were_stored(current: Outputs) -> Non
             assert close(name, array, expected), name
 
 
-def test_figures_are_those_that_were_stored(current: Outputs) -> None:
+def test_figures_equal_the_stored_ones(current: Outputs) -> None:
     figures = stored("figures")
     assert sorted(current.figures) == sorted(figures)
     for name, value in figures.items():

@@ -1,6 +1,6 @@
 """Forty wrong calls, and their answers: exit code and message.
 
-Files are named by their faults; `inputs` writes them.
+Each file is named by its fault. `inputs` writes the files.
 """
 
 from pathlib import Path
@@ -92,7 +92,7 @@ def answer(words: str) -> dict[str, object]:
     # Lines of the log come first. Some of them, such as the memory, differ between machines.
     lines = result.stderr.splitlines()
     error = next((line for line in lines if line.startswith("beers-deploy: ")), result.stderr)
-    # Click draws a box around what is wrong with an option, under a line of usage.
+    # Click draws a box around the fault of an option, under a line of usage.
     message = " ".join(word for word in error.split() if not set(word) <= set("╭─│╮╰╯"))
     left = sorted({path.name for path in Path().iterdir()} - before)
     return {"exit code": result.exit_code, "message": message, "left behind": left}
