@@ -14,8 +14,8 @@ from examples.networks import NETWORKS, build, to_onnx
 MAX_DIFFERENCE = 1e-5
 
 
-def seeded_network(name: str, seed: int = 0) -> nn.Module:
-    return build(name, torch.Generator().manual_seed(seed))
+def seeded_network(name: str) -> nn.Module:
+    return build(name, torch.Generator().manual_seed(0))
 
 
 def shapes(name: str) -> list[tuple[int, int, int, int]]:
