@@ -1,4 +1,4 @@
-"""Several boards in one table, the DPU that meets a time, and networks that run on whole images."""
+"""Tests of several boards in one table, and of networks that run on whole images."""
 
 import math
 import re
@@ -43,7 +43,7 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def classifier(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Ten classes of images of 32 x 32 pixels."""
+    """Return a classifier of images of 32 x 32 pixels into ten classes."""
     path = tmp_path_factory.mktemp("net") / "classifier.onnx"
     features = nn.Sequential(
         nn.Conv2d(1, 16, 3, stride=2, padding=1),
@@ -65,7 +65,7 @@ def names(rows: Sequence[Row]) -> list[str]:
     return [row.name for row in rows]
 
 
-def test_all_boards_stand_in_one_table_with_their_processors_and_the_papers_rows(
+def test_one_table_has_all_boards_their_processors_and_the_papers_rows(
     network: Path,
 ) -> None:
     result = bench(network, "all")
@@ -86,19 +86,19 @@ def test_all_boards_stand_in_one_table_with_their_processors_and_the_papers_rows
 def test_the_smallest_dpu_that_meets_a_time_is_named(network: Path) -> None:
     boards = [load_dpu("vck190", name) for name in ("C32B1", "C32B3", "C32B6")]
     rows = sweep_rows(network, Swath(3000, 2600, 128, 5), boards, [256, 128])
-    sizes = [row.figures["latency"].value or math.inf for row in rows]
-    slowest = max(sizes)
-    fastest = min(sizes)
+    times_s = [row.figures["latency"].value or math.inf for row in rows]
+    slowest = max(times_s)
+    fastest = min(times_s)
     assert "C32B1" in within_words(rows, boards, 10 * slowest)
     assert within_words(rows, boards, fastest / 1000).endswith("none of these")
     words = within_words(rows, boards, fastest)
-    name = rows[int(np.argmin(sizes))].name
+    name = rows[int(np.argmin(times_s))].name
     assert f"by the prediction {name}" in words
     assert "by the whole interval" not in words
 
 
-def test_next_to_the_papers_run_stands_one_counted_alike(network: Path) -> None:
-    """Of the default configuration, also where whole tiles of all are compared."""
+def test_one_row_is_counted_as_the_paper_counts(network: Path) -> None:
+    """It is that of the default configuration, even if whole tiles of all are compared."""
     one = bench(network, dpu="C32B3").rows
     (alike,) = [row for row in one if "as the paper counts" in row.name]
     (same,) = [row for row in bench(network, dpu="all").rows if "as the paper counts" in row.name]
@@ -117,7 +117,7 @@ def test_the_first_line_warns_of_a_board_of_which_little_is_known(
 
 
 @pytest.mark.parametrize(("others", "warned"), [(0.5, True), (0.1, False)])
-def test_the_first_line_warns_where_others_load_the_machine(
+def test_the_first_line_warns_if_other_programs_load_the_machine(
     network: Path, monkeypatch: pytest.MonkeyPatch, others: float, warned: bool
 ) -> None:
     monkeypatch.setattr(traditional, "load_of_others", lambda *_: others)
@@ -127,7 +127,7 @@ def test_the_first_line_warns_where_others_load_the_machine(
 
 
 def test_a_network_that_is_not_tiled_is_predicted_by_the_frame(classifier: Path) -> None:
-    # Only a swath is restored by the traditional pipeline, which is asked for here in vain.
+    # The traditional pipeline restores only swaths, so `traditional` has no effect here.
     result = bench(classifier, size=None, traditional=True)
     (frame,) = [row for row in result.rows if row.table == "frames"]
     assert (frame.figures["throughput"].interval or (0, 0))[0] > 0
@@ -137,7 +137,7 @@ def test_a_network_that_is_not_tiled_is_predicted_by_the_frame(classifier: Path)
     assert any("whole images" in note and "GlobalAveragePool" in note for note in result.notes)
     assert not any("traditional" in name for name in names(result.rows))
     with pytest.raises(ModelError, match=r"GlobalAveragePool.*by the frame, leave out `size`\."):
-        # A size is that of a swath.
+        # A size describes a swath.
         bench(classifier, size="300x260")
 
 
@@ -171,9 +171,9 @@ def test_the_exposures_of_an_image_are_counted_whatever_the_bits_of_the_sensor(
     pixels[:, :128] = 200
     tifffile.imwrite(tmp_path / "image.tif", pixels)
     boards, _ = boards_for(boards_of("vck190"), None, None)
-    asked = Question(boards, [], None, [128], "exact", None, None, consistency=True)
+    question = Question(boards, [], None, [128], "exact", None, None, consistency=True)
     dn = read_acquisition(tmp_path / "image.tif", 4095, None)
-    result = bench_board(Network.load(network), asked, dn, sensor)
+    result = bench_board(Network.load(network), question, dn, sensor)
     (words,) = (note for note in result.notes if "by exposure" in note)
     shares = dict(re.findall(r"(x\d+) (\d+)%", words))
     assert shares.keys() == {"x1", "x4", "x16"}
@@ -199,10 +199,10 @@ def test_a_curve_of_another_shape_takes_the_host_longer(network: Path) -> None:
     sensor = Sensor.load("pleiades-degraded")
     departing = sensor.with_fields(response=table, **axes_of(table, "stated", "for a test"))
     boards, _ = boards_for(boards_of("vck190"), None, None)
-    asked = Question(boards, [], (700, 600), [128], "exact", None, None, consistency=True)
+    question = Question(boards, [], (700, 600), [128], "exact", None, None, consistency=True)
     times = []
     for profile in (sensor, departing):
-        rows = bench_board(Network.load(network), asked, sensor=profile).rows
+        rows = bench_board(Network.load(network), question, sensor=profile).rows
         step, *_ = [r.figures["consistency step"] for r in rows if "consistency step" in r.figures]
         assert step.interval is not None
         times.append(step.interval[1])

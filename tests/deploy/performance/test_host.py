@@ -1,4 +1,4 @@
-"""Measured on this machine: networks interleaved, their nodes, load and memory."""
+"""Tests of the figures of networks that are measured on this machine, interleaved."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -55,7 +55,7 @@ def test_the_other_precision_is_a_shipped_network_of_the_same_variant() -> None:
     assert shapes[0] == shapes[1]
 
 
-def test_a_network_of_another_make_runs_alone(tmp_path: Path) -> None:
+def test_a_network_that_is_not_shipped_runs_alone(tmp_path: Path) -> None:
     path = float_convbeers(tmp_path / "f.onnx", 1, 8)
     assert other_precision(Network.load(path)) is None
     assert [row.name for row in host_rows(path, QUICK, 32, 1) if row.table == "host"] == [

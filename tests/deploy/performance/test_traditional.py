@@ -1,4 +1,4 @@
-"""The traditional pipeline: measured here on crops, stored for a board's processor."""
+"""Tests of the traditional pipeline's time: measured on crops, or stored for a processor."""
 
 from dataclasses import replace
 
@@ -32,7 +32,7 @@ def test_a_drawn_acquisition_is_no_larger_than_the_crops_need() -> None:
     assert max(drawn_acquisition(Swath(9000, 40), *SENSORS).shape) == 3 * CROP_PX
 
 
-def test_the_boards_processor_holds_the_papers_run_and_lacks_what_its_file_lacks() -> None:
+def test_the_processor_s_interval_contains_the_paper_s_time_and_its_reason_names_the_key() -> None:
     board = TargetProfile.load("vck190")
     figures = processor_row(SWATH, board).figures
     # The paper publishes 1724 s and 22.5 W for this pipeline on the VCK190's processor.

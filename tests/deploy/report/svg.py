@@ -1,4 +1,4 @@
-"""What tests ask of the text in a plot."""
+"""Functions that measure the text and read the styles in a plot."""
 
 from xml.etree import ElementTree as ET
 
@@ -9,8 +9,9 @@ from beers_deploy.report.plots import FONT_PX, look
 
 
 def text_width(text: str, size_px: float = FONT_PX) -> float:
-    """Width of a line in pixels, in matplotlib's own font: wider than those that a browser takes in
-    its place.
+    """Return the width of a line in pixels in matplotlib's own font.
+
+    It is wider than the fonts that a browser uses instead.
     """
     with look():
         width, _, _ = text_to_path.get_text_width_height_descent(
@@ -20,6 +21,6 @@ def text_width(text: str, size_px: float = FONT_PX) -> float:
 
 
 def style_of(element: ET.Element) -> dict[str, str]:
-    """The inline style of an element."""
+    """Return the inline style of an element."""
     parts = (part.split(":", 1) for part in element.get("style", "").split(";") if part)
     return {key.strip(): value.strip() for key, value in parts}

@@ -1,4 +1,4 @@
-"""A report's tables lose nothing, and turn when their figures would not fit beside each other."""
+"""Tests that a report's tables are complete, and are transposed if their figures do not fit."""
 
 import re
 from html import unescape
@@ -10,7 +10,7 @@ from beers_deploy.report.page import WIDE, Report, Section, render
 
 
 def lines(rows: list[Row]) -> list[list[str]]:
-    """The texts of a page's table, line by line, cell by cell."""
+    """Return the text of each cell of a page's table, row by row."""
     page = render(Report("A page", "Its headline", [Section("A table", rows)], [], []))
     cells = [
         re.findall(r"<t[dh]\b[^>]*>(.*?)</t[dh]>", line, re.DOTALL)
@@ -35,20 +35,20 @@ def rows_of(figures: int, count: int) -> list[Row]:
 @pytest.mark.parametrize(
     ("figures", "count"), [(1, 1), (WIDE, 2), (WIDE + 1, 2), (WIDE + 1, WIDE + 3)]
 )
-def test_every_figure_stands_where_its_row_and_name_meet(figures: int, count: int) -> None:
+def test_every_figure_is_in_the_cell_of_its_row_and_name(figures: int, count: int) -> None:
     rows = rows_of(figures, count)
     (_, *columns), *body = lines(rows)
-    turned = columns == [row.name for row in rows]
-    assert turned == (figures > WIDE and figures > count)
+    transposed = columns == [row.name for row in rows]
+    assert transposed == (figures > WIDE and figures > count)
     for head, *cells in body:
         for column, cell in zip(columns, cells, strict=True):
-            name, figure = (column, head) if turned else (head, column)
+            name, figure = (column, head) if transposed else (head, column)
             row = next(row for row in rows if row.name == name)
             assert cell == f"{row.figures[figure.removesuffix(' s')]} measured"
 
 
 @pytest.mark.parametrize("figures", [2, WIDE + 2])
-def test_words_and_what_is_missing_are_told(figures: int) -> None:
+def test_texts_and_reasons_of_missing_figures_are_shown(figures: int) -> None:
     row = Row(
         "t",
         "one",

@@ -29,7 +29,7 @@ def test_ticks_are_round(low: float, high: float, logarithmic: bool, values: lis
 
 
 def drawn() -> str:
-    """A line with every kind of text, two of its letters dangerous."""
+    """Return the SVG of a line with every kind of text, with markup and a control character."""
     with look():
         figure = new_figure(300, 200)
         axes = figure.add_subplot(xlabel="$cost$ <a> & \x01", ylabel="quality \u4e2d")
@@ -46,7 +46,7 @@ def test_words_in_an_svg_are_plain_text_whatever_a_name_holds() -> None:
 def test_every_colour_of_an_svg_follows_the_screen() -> None:
     text = drawn()
     for name, colour in LIGHT.items():
-        assert text.count(colour) == 1, "in the style sheet alone"
+        assert text.count(colour) == 1, "it must be in the style sheet only"
         assert f"--{name}: {DARK[name]};" in text
     assert "stroke: var(--mark0)" in text
 

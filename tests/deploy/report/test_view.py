@@ -1,4 +1,4 @@
-"""The view of a run: its layers, its tiles, and how it looks and moves in a browser."""
+"""Tests of the view of a run: its layers, its tiles, and its page in a browser."""
 
 import base64
 import io
@@ -43,7 +43,7 @@ def noise(*shape: int) -> np.ndarray:
     return np.random.default_rng(5).integers(100, 4000, shape).astype(np.uint16)
 
 
-def made(folder: Path, raw: np.ndarray, restored: np.ndarray, **options: Any) -> list[Layer]:
+def layers_from(folder: Path, raw: np.ndarray, restored: np.ndarray, **options: Any) -> list[Layer]:
     """Return the layers of two arrays of pixels."""
     before = write(folder / "raw.tif", raw, **options)
     after = write(folder / "restored.tif", restored, **options)
@@ -55,7 +55,7 @@ def test_raw_and_restored_have_one_stretch_and_no_change_is_mid_grey(tmp_path: P
     restored = raw.copy()
     restored[:9] += 50
     restored[9:12] -= 50
-    before, after, difference = made(tmp_path, raw, restored)
+    before, after, difference = layers_from(tmp_path, raw, restored)
     assert [layer.name for layer in (before, after)] == ["raw image", "restored image"]
     assert_array_equal(before.pixels[12:], after.pixels[12:])
     black, white = (words.split()[0] for _, words in before.legend)
@@ -97,10 +97,10 @@ def test_a_large_image_is_reduced_to_means_of_known_pixels(
 
 def test_three_bands_are_a_colour_image_and_other_numbers_show_the_first(tmp_path: Path) -> None:
     three = noise(3, 40, 50)
-    before, _, difference = made(tmp_path, three, three + 9)
+    before, _, difference = layers_from(tmp_path, three, three + 9)
     assert before.pixels.shape == difference.pixels.shape == (40, 50, 3)
     assert not np.array_equal(before.pixels[..., 0], before.pixels[..., 1])
-    assert made(tmp_path, three[:2], three[:2])[0].pixels.shape == (40, 50)
+    assert layers_from(tmp_path, three[:2], three[:2])[0].pixels.shape == (40, 50)
 
 
 def test_an_enlarged_image_covers_the_same_place_and_has_no_difference(tmp_path: Path) -> None:
@@ -136,20 +136,20 @@ def test_the_tiles_of_each_level_are_the_whole_picture() -> None:
     pixels = np.linspace(0, 255, shape[0] * shape[1]).reshape(shape).astype(np.uint8)
     levels = pyramid(Image.fromarray(pixels))
     assert [(len(level), len(level[0])) for level in levels] == [(1, 1), (1, 2), (2, 3)]
-    rows = [np.concatenate([decoded(tile) for tile in row], axis=1) for row in levels[-1]]
+    rows = [np.concatenate([decode_tile(tile) for tile in row], axis=1) for row in levels[-1]]
     whole = np.concatenate(rows)
     assert whole.shape == shape
     # JPEG of quality 90.
     assert np.abs(whole.astype(int) - pixels).max() <= 4
 
 
-def decoded(address: str) -> np.ndarray:
+def decode_tile(address: str) -> np.ndarray:
     encoded = address.partition("base64,")[2]
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(encoded))))
 
 
 def test_restore_writes_a_page_that_holds_all_it_needs(model: Path, tmp_path: Path) -> None:
-    """No address outside the page is allowed, and names from files are escaped."""
+    """The page allows no address outside itself, and escapes names of files."""
     image = write(tmp_path / "<b>raw.tif", noise(60, 80))
     out = tmp_path / "out.tif"
     page = tmp_path / "pages" / "view.html"
@@ -158,7 +158,7 @@ def test_restore_writes_a_page_that_holds_all_it_needs(model: Path, tmp_path: Pa
     assert "default-src 'none'" in text
     assert "<b>raw" not in text
     assert "Redistribution and use in source and binary forms" in text
-    names = [layer["name"] for layer in described(text)]
+    names = [layer["name"] for layer in layers_in(text)]
     assert names == ["raw image", "restored image", "difference"]
     # A run that is repeated writes the same page.
     page.unlink()
@@ -166,7 +166,7 @@ def test_restore_writes_a_page_that_holds_all_it_needs(model: Path, tmp_path: Pa
     assert page.read_text(encoding="utf-8") == text
 
 
-def described(page: str) -> list[Mapping[str, Any]]:
+def layers_in(page: str) -> list[Mapping[str, Any]]:
     match = re.search(r'id="layers">(.*?)</script>', page, re.DOTALL)
     assert match
     layers: list[Mapping[str, Any]] = json.loads(match[1])
@@ -226,12 +226,12 @@ return report;
 """
 
 
-def test_the_line_parts_left_from_right_at_the_width_of_a_desk_and_of_a_telephone(
+def test_the_divider_separates_two_layers_on_a_desktop_and_on_a_telephone(
     tmp_path: Path,
 ) -> None:
     """The raw image is dark, the restored one is brighter, and the blocks agree.
 
-    The line is moved by keys, and nothing is loaded from elsewhere.
+    The divider is moved by keys, and nothing is loaded from elsewhere.
     """
     raw = np.tile(np.array([1000, 1000, 1000, 400, 3000], np.uint16), (HEIGHT, WIDTH))[:, :WIDTH]
     raw[100:500] = 1000
