@@ -33,10 +33,10 @@ def restored(
     """Write pixels to a file, restore it, and read the result.
 
     Args:
-        folder: of the two files.
-        pixels: of the image.
-        tags: of its TIFF, as tifffile takes them.
-        options: of `restore`.
+        folder: the folder of the two files.
+        pixels: the pixels of the image.
+        tags: options of tifffile for the image.
+        options: the options of `restore`.
     """
     tifffile.imwrite(folder / "in.tif", pixels, **(tags or {}))
     (row,) = restore(folder / "in.tif", folder / "out.tif", overwrite=True, **options).rows
@@ -58,12 +58,12 @@ def names(folder: Path) -> list[str]:
 
 
 def marked(nodata: float) -> dict[str, Any]:
-    """Return tags of a TIFF in which this value marks missing pixels, as tifffile takes them."""
+    """Return options of tifffile for a TIFF in which this value marks missing pixels."""
     return {"extratags": [(42113, "s", 0, f"{nodata}", True)]}
 
 
 PLANES: dict[str, Any] = {"planarconfig": "separate", "photometric": "minisblack"}
-"""Layout of a TIFF of several bands, as tifffile takes it."""
+"""Options of tifffile for a TIFF of several bands."""
 
 NAME = "pleiades-degraded"
 TRANSFORM = rasterio.Affine(0.5, 0.1, 500000, 0.05, -0.5, 4600000)
@@ -71,8 +71,9 @@ NODATA = 65535
 
 
 def two_bands(path: Path) -> np.ndarray:
-    """Write two bands of one image (150, 214) at a place on Earth, and return the first band. In
-    the second one the first 64 x 64 pixels are missing.
+    """Write a georeferenced image of two bands (150, 214), and return the first band.
+
+    In the second band the first 64 x 64 pixels are missing.
     """
     band = pair_of_bands().degraded[:150]
     second = band.copy()
@@ -121,7 +122,7 @@ def until(running: subprocess.Popen[str], word: str) -> bool:
 
 
 def stop_after(tiles: int, patch: pytest.MonkeyPatch, error: BaseException) -> None:
-    """Raise an error in the engine after so many tiles."""
+    """Raise an error in the engine after this number of tiles."""
     count = iter(range(10**6))
     tile = Restorer.tile
 
@@ -135,7 +136,7 @@ def stop_after(tiles: int, patch: pytest.MonkeyPatch, error: BaseException) -> N
 
 @contextmanager
 def stopped_after(tiles: int, error: BaseException | None = None) -> Iterator[None]:
-    """Stop the run in this block after some tiles, by an error or as Ctrl-C does, and expect it."""
+    """Stop the run in this block after some tiles, by an error or as Ctrl-C does."""
     error = error or KeyboardInterrupt()
     with pytest.MonkeyPatch.context() as patch:
         stop_after(tiles, patch, error)

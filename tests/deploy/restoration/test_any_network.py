@@ -1,5 +1,6 @@
-"""Users' networks, with strides, larger results and several bands: tiles give the pixels of the
-whole image, bit for bit.
+"""Tests that users' networks give the same pixels in tiles as on the whole image, bit for bit.
+
+The networks have strides, larger results and several bands.
 """
 
 from collections.abc import Callable
@@ -90,7 +91,7 @@ def by_file(
 
 
 @pytest.mark.parametrize(("size", "tile_px"), [(SIZE, 56), ((3, 50), 83), ((147, 1), 83)])
-def test_tiled_is_whole_in_files_arrays_and_lazy_arrays(
+def test_tiles_equal_the_whole_image_in_files_arrays_and_lazy_arrays(
     size: tuple[int, int], tile_px: int, path: Path, tmp_path: Path
 ) -> None:
     pixels = noise(path, size)
@@ -107,7 +108,7 @@ def test_tiled_is_whole_in_files_arrays_and_lazy_arrays(
         assert_array_equal(lazy.compute(scheduler="synchronous"), expected)
 
 
-def test_one_lattice_less_of_halo_shows_seams(path: Path, tmp_path: Path) -> None:
+def test_a_halo_that_is_one_step_smaller_shows_seams(path: Path, tmp_path: Path) -> None:
     tiling = tiling_of(load_onnx(path))
     pixels = noise(path)
     halo = tiling.halo_px - tiling.alignment_px
@@ -117,9 +118,7 @@ def test_one_lattice_less_of_halo_shows_seams(path: Path, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("path", ["ESPCN", "INT8 half resolution", "4 bands to 2"], indirect=True)
 def test_missing_pixels_stay_and_corrupt_no_others(path: Path, tmp_path: Path) -> None:
-    """Of larger results, strides and several bands; the last row and column, which the extension
-    copies, are among them.
-    """
+    """Missing pixels are also in the last row and column, which the extension copies."""
     pixels = noise(path)
     pixels[..., 60:90, 40:60] = 0
     pixels[..., -3:, -5:] = 0
@@ -149,7 +148,7 @@ def test_a_run_that_was_stopped_is_resumed_to_the_same_bytes(path: Path, tmp_pat
 
 
 def espcn_of_two_bands() -> onnx.ModelProto:
-    """Return a network that states another shape of its result than it has."""
+    """Return a network whose file states a wrong shape of its result."""
     model = espcn()
     model.graph.output[0].type.tensor_type.shape.dim[1].dim_value = 2
     return model
@@ -193,7 +192,7 @@ def test_what_cannot_be_restored_is_refused_in_one_sentence(
     assert not (tmp_path / "out.tif").exists()
 
 
-def test_halos_and_tiles_off_the_lattice_are_refused_or_rounded() -> None:
+def test_halos_that_are_not_aligned_are_refused_and_tiles_rounded() -> None:
     tiling = Tiling(8, 4)
     with pytest.raises(
         OptionError, match=r"`halo` must be a multiple of 4 px.*got 7 px.*8 px is exact"

@@ -1,4 +1,4 @@
-"""Cloud-Optimised GeoTIFFs are valid, and have the pixels and the place of the plain output."""
+"""Tests that Cloud-Optimised GeoTIFFs are valid and equal the plain output."""
 
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ cogeo: Any = pytest.importorskip("rio_cogeo")
 
 
 @pytest.mark.parametrize("compression", get_args(Compression))
-def test_it_is_valid_and_holds_the_same(
+def test_a_cog_is_valid_and_equals_the_plain_output(
     compression: Compression, model: Path, tmp_path: Path
 ) -> None:
     pixels = np.tile(np.maximum(images.digital_numbers(), 1), (1, 4, 5))
@@ -67,7 +67,7 @@ def test_it_records_what_was_done(tmp_path: Path) -> None:
     assert tags["RESTORED_BY"].startswith("beers-deploy ")
 
 
-def test_a_run_stopped_while_it_is_written_goes_on(
+def test_a_run_that_stops_while_it_writes_can_be_resumed(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = partial(restore, network=model, tile=64, cog=True)
@@ -92,7 +92,7 @@ def test_a_run_stopped_while_it_is_written_goes_on(
 
 
 @pytest.mark.parametrize("shape", [(1, 150, 118), (1, 600, 1), (2, 520, 90), (2, 90, 1700)])
-def test_all_that_is_on_the_disk_at_a_time_is_checked_before_the_run(
+def test_the_space_for_all_files_on_the_disk_is_checked_before_the_run(
     shape: tuple[int, int, int], model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One byte less is refused before any work. The space that is asked for is used, apart from

@@ -1,4 +1,4 @@
-"""Faulty detectors are reported, listed, and replaced before the restoration."""
+"""Tests that faulty detectors are reported, listed, and replaced before the restoration."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -34,12 +34,12 @@ NOISE = 5.0
 
 
 def ground(*shape: int, seed: int = 0) -> np.ndarray:
-    """An even raw image, uint16."""
+    """Return a noisy raw image of even ground, uint16."""
     return np.rint(np.random.default_rng(seed).normal(LEVEL, NOISE, shape)).astype(np.uint16)
 
 
 def faulty() -> np.ndarray:
-    """Dead and hot pixels, a dead column and a dead row, far apart."""
+    """Return an image with dead and hot pixels, a dead column and a dead row, far apart."""
     pixels = ground(HEIGHT, WIDTH)
     pixels[:, 40] = 0
     pixels[100] = 4095
@@ -57,18 +57,18 @@ def fixed(pixels: np.ndarray, faults: Iterable[Fault], nodata: float | None = No
     return np.asarray(source.read(0, len(pixels))[0])
 
 
-def found(pixels: np.ndarray, nodata: float | None = None) -> list[Fault]:
+def faults_of(pixels: np.ndarray, nodata: float | None = None) -> list[Fault]:
     return list(find_faults(source_of(pixels, nodata), "image").faults)
 
 
 def test_all_kinds_are_found_in_each_band_and_in_floats() -> None:
     bands = np.stack([ground(HEIGHT, WIDTH, seed=3), faulty()])
-    assert found(bands) == [replace(fault, band=2) for fault in FAULTS]
+    assert faults_of(bands) == [replace(fault, band=2) for fault in FAULTS]
     floats = faulty().astype(np.float32) * np.float32(0.37)
     floats[:10, :30] = np.nan
-    assert found(floats) == FAULTS
+    assert faults_of(floats) == FAULTS
     # Dead pixels are missing here, since 0 marks missing ones.
-    assert found(faulty(), nodata=0.0) == [Fault(-1, 100), Fault(80, 20)]
+    assert faults_of(faulty(), nodata=0.0) == [Fault(-1, 100), Fault(80, 20)]
 
 
 @settings(deadline=None, max_examples=20)
@@ -127,7 +127,7 @@ def test_a_replaced_pixel_never_falls_on_the_nodata_value() -> None:
     assert fixed(pixels, [Fault(4, 4)], nodata=10.0)[4, 4] in (9, 11)
 
 
-def test_a_fault_without_a_sound_pixel_nearby_stays() -> None:
+def test_a_fault_without_a_valid_pixel_nearby_stays() -> None:
     pixels = ground(5, 80)
     columns = [Fault(column, -1) for column in range(80)]
     assert_array_equal(fixed(pixels, columns), pixels)
@@ -176,11 +176,11 @@ def test_a_list_that_does_not_fit_is_refused(tmp_path: Path, text: str | None, w
     assert words in str(error.value)
 
 
-def test_an_image_full_of_single_pixels_has_no_single_faults() -> None:
+def test_an_image_with_too_many_faulty_pixels_is_refused() -> None:
     pixels = ground(HEIGHT, WIDTH)
     pixels[5::7, 5::7] = 4095
     with pytest.raises(ImageError, match="too many faulty pixels"):
-        found(pixels)
+        faults_of(pixels)
 
 
 def test_sentences_name_kind_place_and_remedy() -> None:
@@ -205,7 +205,7 @@ def test_sentences_name_kind_place_and_remedy() -> None:
     assert not sentences(look_at_detectors(source_of(ground(HEIGHT, WIDTH)), 4095))
 
 
-def test_of_a_large_image_few_rows_are_read() -> None:
+def test_few_rows_of_a_large_image_are_read() -> None:
     class Counting(ArraySource):
         rows = 0
 
@@ -238,7 +238,7 @@ def test_a_restoration_sees_the_replaced_pixels(image: Path, model: Path, tmp_pa
     run(image, tmp_path / "again.tif", fix_detectors=str(listed))
     assert_array_equal(tifffile.imread(tmp_path / "again.tif"), expected)
     assert not (tmp_path / "again.detectors.csv").exists()
-    # In what is fixed no fault is left, and the list says so in place of the older one.
+    # The fixed image has no fault, so an empty list replaces the older one.
     run(clean, out, fix_detectors="found")
     assert listed.read_text() == "column,row\n"
     run(clean, out, fix_detectors=str(listed))
@@ -248,14 +248,14 @@ def test_a_restoration_sees_the_replaced_pixels(image: Path, model: Path, tmp_pa
     assert "dead lines" in shown
 
 
-def test_no_warning_recommends_what_was_asked_for(
+def test_no_warning_recommends_an_option_that_was_given(
     image: Path,
     model: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """The finder leaves what the look at the detectors sees."""
+    """Here the search finds no fault, but the check before the run reports one."""
     monkeypatch.setattr(
         "beers_deploy.restoration.detectors.fix.find_faults", lambda *_: FaultList(())
     )
@@ -267,7 +267,7 @@ def test_no_warning_recommends_what_was_asked_for(
         assert warnings[0].count("found replaces") == count
 
 
-def test_a_stopped_run_goes_on_with_the_same_faults(
+def test_a_stopped_run_is_resumed_with_the_same_faults(
     image: Path, model: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out.tif"

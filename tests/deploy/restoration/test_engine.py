@@ -1,4 +1,4 @@
-"""Tiles restored several at a time give the rows that they give one by one."""
+"""Tests that tiles restored several at a time give the same rows as one at a time."""
 
 import os
 import threading
@@ -24,8 +24,8 @@ TILE_PX = 32
 RADIUS_PX = 3
 
 
-def running(infer: Infer, at_once: int, tick: Callable[[], None] = lambda: None) -> np.ndarray:
-    """A noisy image of two bands through `infer`."""
+def restored_by(infer: Infer, at_once: int, tick: Callable[[], None] = lambda: None) -> np.ndarray:
+    """Restore a noisy image of two bands by `infer`."""
     pixels = np.random.default_rng(0).integers(0, 4096, SHAPE).astype(np.uint16)
     raster = Raster(*SHAPE, pixels.dtype, None)
     plan: Plan = make_plan(raster.shape, TILE_PX, RADIUS_PX, Tiling(RADIUS_PX))
@@ -41,14 +41,14 @@ def brighter(image: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("at_once", [2, 3, 4])
-def test_rows_are_the_same_however_many_tiles_are_in_work(at_once: int) -> None:
-    assert np.array_equal(running(brighter, at_once), running(brighter, 1))
+def test_rows_are_the_same_however_many_tiles_run_at_once(at_once: int) -> None:
+    assert np.array_equal(restored_by(brighter, at_once), restored_by(brighter, 1))
 
 
-def test_as_many_tiles_are_in_work_as_were_asked_for() -> None:
-    """Each call waits for a second one: one at a time would wait in vain.
+def test_the_requested_number_of_tiles_run_at_once() -> None:
+    """Each call waits for a second one, so that a single call would time out.
 
-    Two bands make their number even.
+    Two bands make the number of calls even.
     """
     together = threading.Barrier(2, timeout=10)
 
@@ -56,7 +56,7 @@ def test_as_many_tiles_are_in_work_as_were_asked_for() -> None:
         together.wait()
         return brighter(image)
 
-    assert np.array_equal(running(patient, 2), running(brighter, 1))
+    assert np.array_equal(restored_by(patient, 2), restored_by(brighter, 1))
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_after_an_error_or_a_stop_no_further_tile_is_begun(
 
     def slow(image: np.ndarray) -> np.ndarray:
         calls.append(1)
-        # A tile takes longer than the news of an error, so later calls wait a little.
+        # A real tile takes longer than an error takes to arrive, so later calls wait a little.
         if len(calls) > 2:
             going.wait(0.2)
         return brighter(image) * np.float32(factor)
@@ -80,8 +80,8 @@ def test_after_an_error_or_a_stop_no_further_tile_is_begun(
         raise KeyboardInterrupt("a stop")
 
     with pytest.raises(error, match=words):
-        running(slow, 2, stop)
-    assert len(calls) < 10, "the first two rows of tiles have twenty"
+        restored_by(slow, 2, stop)
+    assert len(calls) < 10, "the first two rows have 20 tiles"
 
 
 @given(threads=st.integers(0, 256), tiles=st.integers(0, 1000))

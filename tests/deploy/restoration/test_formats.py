@@ -1,4 +1,4 @@
-"""Formats that GDAL reads give the same pixels and the same place on Earth as a TIFF."""
+"""Tests of inputs in formats that GDAL reads: their metadata, their tiles and their faults."""
 
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ def test_polynomials_bits_and_gains_of_a_dimap_are_kept(
     with rasterio.open(image) as before, rasterio.open(tmp_path / "out.tif") as after:
         after_rpcs = after.rpcs.to_dict()
         before_rpcs = before.rpcs.to_dict()
-        # A DIMAP's model states its errors in other terms than GeoTIFF's tag.
+        # The errors of a DIMAP's polynomials are defined otherwise than those of a GeoTIFF.
         for key in before_rpcs.keys() - {"err_bias", "err_rand"}:
             assert_allclose(after_rpcs[key], before_rpcs[key], rtol=0, atol=1e-9)
         assert [after.tags(band)["RADIANCE_GAIN"] for band in (1, 2)] == ["9.0", "9.1"]
@@ -46,10 +46,10 @@ def test_control_points_names_and_gains_are_kept(model: Path, tmp_path: Path) ->
     with rasterio.open(tmp_path / "out.tif") as after:
         assert after.descriptions == ("B0", "B1")
         assert (after.scales, after.offsets) == ((0.1, 0.2), (-0.5, -0.25))
-        kept, crs = after.gcps
+        after_points, crs = after.gcps
     assert crs == rasterio.CRS.from_epsg(4326)
     after_numbers, before_numbers = (
-        [(p.col, p.row, p.x, p.y) for p in each] for each in (kept, points)
+        [(p.col, p.row, p.x, p.y) for p in each] for each in (after_points, points)
     )
     assert_allclose(after_numbers, before_numbers, rtol=0, atol=1e-9)
 
@@ -67,7 +67,7 @@ def test_a_truncated_jpeg_2000_is_an_error_of_one_line(
     assert capfd.readouterr().err == ""
 
 
-def test_a_tile_is_no_output(model: Path, tmp_path: Path) -> None:
+def test_a_tile_of_the_input_cannot_be_an_output(model: Path, tmp_path: Path) -> None:
     image = images.write_dimap(tmp_path / "DIM.XML", images.digital_numbers())
     tile = tmp_path / "IMG_R2C1.TIF"
     out = tmp_path / "out.tif"
@@ -79,7 +79,7 @@ def test_a_tile_is_no_output(model: Path, tmp_path: Path) -> None:
         assert tile.read_bytes() == before
 
 
-def test_a_changed_tile_makes_another_image(tmp_path: Path) -> None:
+def test_a_changed_tile_changes_the_fingerprint(tmp_path: Path) -> None:
     image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers())
     with open_raster(image) as source:
         before = fingerprint(source.files)

@@ -1,6 +1,4 @@
-"""Files may be damaged or replaced between two runs: the pixels are right, or an error says why
-not.
-"""
+"""Tests that a run detects files that were damaged or replaced before or during it."""
 
 import logging
 import os
@@ -37,7 +35,7 @@ DAMAGES = st.one_of(
     st.binary(max_size=64).map(lambda more: lambda raw: raw + more),
     st.binary(max_size=2048).map(lambda other: lambda _: other),
 )
-"""Cut short, a bit flipped, grown, or another file."""
+"""A file is truncated, extended or replaced, or one bit is flipped."""
 
 
 def flipped(raw: bytes, bit: int) -> bytes:
@@ -88,7 +86,7 @@ def test_rows_that_match_their_digests_are_kept_and_no_others(
 
 @settings(max_examples=50)
 @given(st.integers(0, 2**16))
-def test_a_journal_with_any_bit_flipped_is_refused_or_the_same(bit: int) -> None:
+def test_a_journal_with_a_flipped_bit_is_refused_or_read_as_before(bit: int) -> None:
     with TemporaryDirectory() as name:
         out = Path(name) / "out.tif"
         checkpoint = Checkpoint(out, (1, 8, 5), np.dtype(np.uint16), JOB, resume=False)
@@ -145,7 +143,7 @@ def flip_the_middle(image: Path) -> None:
         ("in.tif.msk", partial(write_mask, 300), partial(write_mask, 340)),
     ],
 )
-def test_whatever_is_read_is_part_of_the_job(
+def test_a_run_is_not_resumed_after_its_image_or_mask_changed(
     name: str,
     before: Callable[[Path], None],
     after: Callable[[Path], None],
@@ -153,7 +151,7 @@ def test_whatever_is_read_is_part_of_the_job(
     model: Path,
     tmp_path: Path,
 ) -> None:
-    """Also where a file has the same size and time as before."""
+    """The file has the same size and time as before."""
     out = tmp_path / "out.tif"
     run = partial(restore, network=model, tile=TILE_PX)
     before(image)

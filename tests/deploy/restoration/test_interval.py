@@ -1,4 +1,4 @@
-"""`restore --interval`: half-widths of files and arrays, and what refuses them."""
+"""Tests of `restore --interval`: half-widths of files and arrays, and refused inputs."""
 
 from pathlib import Path
 from typing import Any
@@ -57,7 +57,7 @@ def half_widths(out: Path) -> np.ndarray:
         return np.asarray(file.read())
 
 
-def test_the_file_lies_over_the_image_and_has_a_plane_for_each_band(
+def test_the_file_is_georeferenced_and_has_a_plane_for_each_band(
     image: Path, tmp_path: Path
 ) -> None:
     """Half-widths are positive floats where a pixel is known, and NaN where it is missing."""
@@ -90,7 +90,7 @@ def test_tiles_and_stops_change_no_byte(image: Path, tmp_path: Path) -> None:
 
 
 def test_bands_have_the_half_widths_of_their_own_sensors(image: Path, tmp_path: Path) -> None:
-    """The blurred sensor's band, restored from the same pixels, is less certain."""
+    """The same pixels are restored with less certainty for a sensor with more blur."""
     blurred = Sensor.load(NAME).replace(mtf_nyquist=0.03)
     run(image, tmp_path / "out.tif", sensor={"blue": Sensor.load(NAME), "red": blurred})
     run(image, tmp_path / "alike.tif")
@@ -99,7 +99,7 @@ def test_bands_have_the_half_widths_of_their_own_sensors(image: Path, tmp_path: 
     assert np.nanmean(red) > 1.2 * np.nanmean(blue)
 
 
-def test_an_array_comes_with_the_half_widths_of_the_file(image: Path, tmp_path: Path) -> None:
+def test_an_array_has_the_half_widths_of_the_file(image: Path, tmp_path: Path) -> None:
     run(image, tmp_path / "out.tif")
     of_file = half_widths(tmp_path / "out.tif")[0]
     band = pair_of_bands().degraded[:150]
@@ -118,7 +118,7 @@ def test_an_array_comes_with_the_half_widths_of_the_file(image: Path, tmp_path: 
 
 
 def test_most_errors_of_a_drawn_scene_lie_within_the_interval() -> None:
-    """Drawn scenes are no photographs, so only the order of levels and a wide range are asked."""
+    """Drawn scenes are no photographs, so only the order of levels and a wide range are checked."""
     pair = pair_of_bands()
     shares = []
     for level in (50, 90):
@@ -140,7 +140,7 @@ def test_most_errors_of_a_drawn_scene_lie_within_the_interval() -> None:
         ({"interval": 91}, "must be one of 50, 68, 80, 90, 95, 99, got 91"),
     ],
 )
-def test_what_has_no_interval_is_refused_before_a_file_is_written(
+def test_options_without_an_interval_are_refused_before_a_file_is_written(
     options: dict[str, Any], words: str, image: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(OptionError, match=words):
@@ -174,7 +174,7 @@ def test_an_older_file_is_not_replaced(name: str, image: Path, tmp_path: Path) -
 
 @pytest.mark.parametrize("name", shipped_names())
 def test_shipped_networks_have_an_interval_that_another_sensor_keeps(name: str) -> None:
-    """Float and INT8 have their own; it goes where a file is conditioned on another sensor."""
+    """Float and INT8 have different intervals. Conditioning on another sensor keeps them."""
     levels = [50, 68, 80, 90, 95, 99]
     own = [interval_of(bd.Network.load(each, sensor=NAME)) for each in (name, f"{name}-int8")]
     assert [list(interval.quantiles) for interval in own] == [levels, levels]
@@ -184,8 +184,8 @@ def test_shipped_networks_have_an_interval_that_another_sensor_keeps(name: str) 
     assert metadata(other)["interval"] == metadata(model)["interval"]
 
 
-def test_an_interval_does_not_follow_into_other_weights(tmp_path: Path) -> None:
-    """Weights that are written again, and integers of a float network, have none."""
+def test_other_weights_do_not_inherit_the_interval(tmp_path: Path) -> None:
+    """Weights that are saved again have none, and neither has a quantized float network."""
     source = shipped_weights("convbeers-xs")
     assert read_weights(source).interval
     network, recipe = load_network(source)

@@ -1,4 +1,4 @@
-"""Two runs never write one output at once, and a killed run blocks no other."""
+"""Tests that two runs never write one output at once, and that the lock leaves no files."""
 
 import sys
 import threading
@@ -42,7 +42,7 @@ def test_a_second_run_is_refused_and_the_first_one_unharmed(image: Path, tmp_pat
     assert names(tmp_path) == ["in.tif", "other.tif", "out.tif"]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="flock is what POSIX systems lock by")
+@pytest.mark.skipif(sys.platform == "win32", reason="only POSIX systems have flock")
 @pytest.mark.parametrize("number", lock.NO_LOCKS)
 def test_a_disk_without_locks_locks_nothing_and_is_left_clean(
     number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -59,7 +59,7 @@ def test_a_disk_without_locks_locks_nothing_and_is_left_clean(
     assert not folder.exists()
 
 
-def test_new_folders_above_go_with_it_unless_something_was_written_there(tmp_path: Path) -> None:
+def test_new_parent_folders_are_removed_unless_something_was_written_there(tmp_path: Path) -> None:
     out = tmp_path / "new" / "below" / "out"
     with pytest.raises(ZeroDivisionError), only_run(out):
         raise ZeroDivisionError
@@ -75,13 +75,14 @@ def test_new_folders_above_go_with_it_unless_something_was_written_there(tmp_pat
 
 
 @pytest.mark.skipif(
-    sys.platform == "win32", reason="Windows removes no file that is open: nothing can come between"
+    sys.platform == "win32", reason="Windows removes no open file, so this cannot happen"
 )
-def test_a_run_that_ends_just_then_takes_no_lock_along(
+def test_a_run_that_ends_just_before_the_lock_does_not_invalidate_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Between opening the file and locking it, the run that held it ends: the lock must be on the
-    new file.
+    """The previous run ends after the file was opened and before it is locked.
+
+    The lock must then be on the new file.
     """
     import fcntl
 
@@ -103,7 +104,7 @@ def test_a_run_that_ends_just_then_takes_no_lock_along(
             pass
 
 
-def test_many_that_try_are_never_two_at_once(tmp_path: Path) -> None:
+def test_at_most_one_of_many_threads_has_the_lock(tmp_path: Path) -> None:
     inside = [0]
     most = [0]
     refusals = [0]

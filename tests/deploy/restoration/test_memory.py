@@ -1,4 +1,4 @@
-"""What the machine's system says of a process's memory, on systems of every kind."""
+"""Tests of the peak memory of a process, as each kind of system reports it."""
 
 import subprocess
 import sys
@@ -30,7 +30,7 @@ print(before, peak_memory().value)
 """
 
 
-def test_the_peak_counts_what_was_given_back_and_nothing_of_the_parent_s() -> None:
+def test_the_peak_includes_freed_memory_and_excludes_the_parent_s() -> None:
     block = b"x" * (400 * MEGABYTE)
     command = [sys.executable, "-c", TAKE, str(300 * MEGABYTE)]
     process = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -40,8 +40,10 @@ def test_the_peak_counts_what_was_given_back_and_nothing_of_the_parent_s() -> No
     assert gigabytes(peak_memory()) > len(block) / 1e9
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="another way is the only one here")
-def test_every_posix_system_s_way_agrees_with_linux_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has two ways to compare")
+def test_the_posix_way_agrees_with_that_of_linux(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     own = gigabytes(peak_memory())
     monkeypatch.setattr("beers_deploy.restoration.memory.STATUS", NOWHERE)
     # The peak may be that of a parent process, which may have held more.

@@ -1,4 +1,4 @@
-"""One engine: an image is restored to the same pixels by every command and function."""
+"""Tests that every command and function restores an image to the same pixels."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -77,7 +77,7 @@ def ways(path: Path, tile_px: int, halo_px: int) -> Mapping[str, Restored]:
 def test_every_command_gives_the_pixels_of_restore(
     is_exact: bool, precision: str, path: Path, tmp_path: Path
 ) -> None:
-    """With exact seams, and with a halo below the radius, which shows seams."""
+    """This holds for exact seams, and for a halo below the radius, which shows seams."""
     pixels = image()
     dn = pixels.astype(np.float32)
     network = bd.Network.load(path)

@@ -1,4 +1,4 @@
-"""The restored COG as other programs read it: gdalinfo and QGIS, both of the system."""
+"""Tests that the system's QGIS reads the restored COG and runs the example of a tool."""
 
 import json
 import subprocess
@@ -17,7 +17,7 @@ from tests.shipped import shipped_pair
 
 ROOT = Path(__file__).parents[3]
 PYTHON = Path("/usr/bin/python3")
-"""Of the system: packages of QGIS belong to no virtual environment."""
+"""The system's Python, because the packages of QGIS are in no virtual environment."""
 PIXELS = np.tile(images.digital_numbers(), (1, 5, 6))
 IN_QGIS = """
 import json, os, runpy, sys
@@ -27,7 +27,7 @@ application = QgsApplication([], False)
 application.initQgis()
 {}
 sys.stdout.flush()
-os._exit(0)  # no clean end: objects that outlive the application crash there
+os._exit(0)  # a clean end crashes, because some objects outlive the application
 """
 READ = """
 layer = QgsRasterLayer(sys.argv[1], "restored", "gdal")
@@ -36,7 +36,7 @@ bands = range(1, layer.bandCount() + 1)
 blocks = [data.block(band, box, layer.width(), layer.height()) for band in bands]
 grid = range(0, 90, 7)
 values = [[[block.value(row, column) for column in grid] for row in grid] for block in blocks]
-said = {
+facts = {
     "valid": layer.isValid(),
     "crs": layer.crs().authid(),
     "box": [box.xMinimum(), box.yMaximum(), box.xMaximum(), box.yMinimum()],
@@ -49,7 +49,7 @@ said = {
     "overviews": [[each.xDim, each.yDim] for each in data.buildPyramidList() if each.exists],
     "values": values,
 }
-print(json.dumps(said))
+print(json.dumps(facts))
 """
 
 RUN = """
@@ -95,7 +95,7 @@ def restore_with_a_hole(folder: Path, model: Path) -> np.ndarray:
     return restored
 
 
-def test_qgis_shows_what_was_written(qgis: Path, model: Path, tmp_path: Path) -> None:
+def test_qgis_reads_what_was_written(qgis: Path, model: Path, tmp_path: Path) -> None:
     restored = restore_with_a_hole(tmp_path, model)
     layer = answer(qgis, "-c", IN_QGIS.replace("{}", READ), tmp_path / "out.tif")
     place = images.profile()["transform"]
@@ -118,7 +118,7 @@ def test_qgis_shows_what_was_written(qgis: Path, model: Path, tmp_path: Path) ->
 
 
 def test_qgis_s_toolbox_restores(qgis: Path, tmp_path: Path) -> None:
-    """The script is an example for users; an error of the program is an error of QGIS."""
+    """The script is an example for users. QGIS must report an error of the program."""
     image = images.write_tiff(tmp_path / "raw.tif", images.digital_numbers(bands=1))
     program = tmp_path / "beers-deploy"
     program.write_text(f'#!/bin/sh\nPYTHONPATH={ROOT} exec {sys.executable} -m beers_deploy "$@"\n')

@@ -1,6 +1,4 @@
-"""Doubts about a result: 3 % more light on an ordinary scene gives a warning, the results of
-shipped networks give none.
-"""
+"""Tests of warnings about a result: 3 % more light gives one, shipped networks give none."""
 
 import numpy as np
 import pytest
@@ -32,8 +30,8 @@ def doubts_the_mean(counts: Tally) -> bool:
 def test_three_percent_of_an_ordinary_scene_are_doubted_and_one_is_not(
     seed: int, mean: float, contrast: float, share: float
 ) -> None:
-    """The mean is from 8 to 50 % of full scale, the contrast up to half of that, as of most scenes
-    in daylight.
+    """The mean is 8 to 50 % of full scale and the contrast up to half of it, as in most scenes in
+    daylight.
     """
     image = mean * (1 + contrast * np.random.default_rng(seed).uniform(-1, 1, (200, 200)))
     brighter = tally(image, (1 + share) * image)

@@ -1,6 +1,4 @@
-"""Which value is full scale and what states it; what lies above it; and that the type of the pixels
-is kept.
-"""
+"""Tests of full scale: what states it, and how values above it are clipped."""
 
 import logging
 from collections.abc import Callable
@@ -33,7 +31,7 @@ def noise(bits: int) -> np.ndarray:
 
 @pytest.fixture
 def run(model: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> Run:
-    """Return what restores pixels by a file, and returns the result, the row and the log."""
+    """Return a function that restores pixels in a file and returns result, row and log."""
 
     def run(pixels: np.ndarray, **options: Any) -> tuple[np.ndarray, Row, list[str]]:
         caplog.clear()
@@ -61,7 +59,7 @@ def test_the_user_overrides_the_file_and_the_file_overrides_the_sensor() -> None
     assert scale(silent) == FullScale(4095, "assumed: 12 bits", assumed=True)
 
 
-def test_8_bit_pixels_need_it_stated_and_cannot_be_of_more() -> None:
+def test_8_bit_pixels_need_a_stated_full_scale_of_at_most_255() -> None:
     eight = Raster(1, 9, 9, np.dtype(np.uint8))
     for bits in (None, 12):
         with pytest.raises(ImageError, match="8-bit pixels"):
@@ -76,9 +74,7 @@ def test_8_bit_pixels_need_it_stated_and_cannot_be_of_more() -> None:
 def test_a_file_of_other_bits_is_restored_to_its_own_full_scale(
     bits: int, run: Run, model: Path, tmp_path: Path
 ) -> None:
-    """An option, a sensor and the file itself give the same pixels, and no result of 12 bits
-    reaches half of it.
-    """
+    """An option, a sensor and the file itself give the same pixels, some above half of it."""
     full = 2**bits - 1
     pixels = images.digital_numbers(bits, bands=1)
     by_option, row, _ = run(pixels, full_scale=full)
@@ -117,8 +113,9 @@ def test_a_container_states_nothing_and_a_product_s_range_does(tmp_path: Path) -
 
 
 def test_values_above_a_stated_full_scale_are_clipped_counted_and_reported(run: Run) -> None:
-    """Each is counted once, though tiles overlap, and restored as if it were full scale. Missing
-    ones are not among them.
+    """Each is counted once, though tiles overlap, and restored as if it were full scale.
+
+    Missing pixels are not counted.
     """
     pixels = noise(10)
     pixels[5:9, 3:40] = 5000

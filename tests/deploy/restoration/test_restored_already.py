@@ -1,7 +1,4 @@
-"""Without a sensor an image that holds no raw noise is recognised.
-
-A raw image of any sensor in range is not reported.
-"""
+"""Tests that an image without raw noise is reported if no sensor is given, and a raw one is not."""
 
 from collections.abc import Callable
 from functools import cache
@@ -39,14 +36,14 @@ def scene() -> np.ndarray:
 
 @cache
 def raw(seed: int = 0, light: float = 1.0, snr: tuple[float, float] = SNR_BRIGHT) -> np.ndarray:
-    """A raw image (256, 256) of a sensor of the range, at a share of the light."""
+    """Return a raw image (256, 256) of a sensor in the range, at a share of the light."""
     sensor = SensorFamily(SENSOR.nominal(), snr).draw(np.random.default_rng(seed))
     return to_uint16(
         acquire_three(prepare_scene(light * scene(), 1), sensor, sensor, Draw(seed))[0]
     )
 
 
-def look(
+def check(
     image: np.ndarray, full_scale: float = 4095, network: str = NETWORK, nodata: float | None = None
 ) -> str:
     return restored_already(source_of(image, nodata), [Network.load(network).model], full_scale)
@@ -61,7 +58,7 @@ def look(
 def test_a_raw_image_of_any_sensor_in_range_is_not_reported(
     seed: int, light: float, snr: tuple[float, float]
 ) -> None:
-    assert look(raw(seed, light, snr)) == ""
+    assert check(raw(seed, light, snr)) == ""
 
 
 def restored() -> np.ndarray:
@@ -84,36 +81,36 @@ PROCESSED: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 @pytest.mark.parametrize("kind", PROCESSED)
 def test_a_processed_image_is_reported(kind: str) -> None:
     image = PROCESSED[kind](raw(1))
-    sentence = look(image, 16 * 4095 if kind == "left-justified" else 4095)
+    sentence = check(image, 16 * 4095 if kind == "left-justified" else 4095)
     assert "it looks restored already, with" in sentence
     assert "give the raw image, or its own sensor or full scale" in sentence
     assert sentence.isprintable()
 
 
-def test_bands_are_named_where_not_all_are() -> None:
+def test_bands_are_named_if_not_all_are_reported() -> None:
     image = raw(1)
-    assert "already in band 2, with" in look(np.stack([image, PROCESSED["smoothed"](image)]))
+    assert "already in band 2, with" in check(np.stack([image, PROCESSED["smoothed"](image)]))
 
 
-def test_what_cannot_be_seen_is_not_reported(model: Path) -> None:
+def test_an_image_that_cannot_be_judged_is_not_reported(model: Path) -> None:
     smooth = PROCESSED["smoothed"](raw(1))
     # There are too few blocks to judge.
-    assert look(smooth[:100, :100]) == ""
+    assert check(smooth[:100, :100]) == ""
     # These are no integers.
-    assert look(smooth.astype(np.float32) * np.float32(0.7)) == ""
+    assert check(smooth.astype(np.float32) * np.float32(0.7)) == ""
     # The image is filled with one value.
-    assert look(np.full((300, 300), 900, np.uint16)) == ""
-    assert look(np.zeros((300, 300), np.uint16)) == ""
+    assert check(np.full((300, 300), 900, np.uint16)) == ""
+    assert check(np.zeros((300, 300), np.uint16)) == ""
     # This network is for another kind of image.
-    assert look(smooth, network=str(model)) == ""
-    assert look(raw(1) // 2, full_scale=2047) == ""
+    assert check(smooth, network=str(model)) == ""
+    assert check(raw(1) // 2, full_scale=2047) == ""
 
 
 @pytest.mark.parametrize("nodata", [None, 0])
 def test_filled_parts_of_a_raw_image_do_not_count(nodata: int | None) -> None:
     image = raw(2).copy()
     image[:, :150] = 0 if nodata is not None else 1
-    assert look(image, nodata=nodata) == ""
+    assert check(image, nodata=nodata) == ""
 
 
 def test_the_command_warns_and_goes_on(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
-"""Whatever stops a run, the output is the old one or the new one, and a resumed run gives the same
-bytes.
+"""Tests that a stopped run leaves the old output or the new one, and is resumed to the same bytes.
 
-BEERS_KILLS=50 kills as many runs; the suite kills a few.
+BEERS_KILLS=50 kills 50 runs. The suite kills a few.
 """
 
 import errno
@@ -40,7 +39,7 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def expected(image: Path, model: Path) -> bytes:
-    """Return the bytes of a run that nothing disturbs."""
+    """Return the bytes of an undisturbed run."""
     out = image.with_name("expected.tif")
     restore(image, out, network=model, tile=TILE_PX)
     return out.read_bytes()

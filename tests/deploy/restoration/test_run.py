@@ -1,4 +1,4 @@
-"""Files restored in tiles: the pixels of the whole image's result bit for bit, and the metadata."""
+"""Tests that a file restored in tiles equals the whole image's result, bit for bit."""
 
 import sys
 from functools import partial
@@ -32,7 +32,7 @@ SHAPES: dict[tuple[int, int], type] = {
     (40, 1): np.float32,
     (3, 5): np.uint16,
 }
-"""Images of several tiles, of one in one or both directions, and smaller than the radius."""
+"""Images of several tiles, of one tile in one or both directions, and smaller than the radius."""
 
 
 def by_file(
@@ -62,7 +62,7 @@ def test_tiled_equals_whole_bit_for_bit_in_files_and_arrays(
     for way in (result, restore(pixels, network=model, tile=23)):
         assert way.dtype == dtype
         assert_array_equal(way, expected)
-    # Integers are packed as differences, which floats would not be smaller by.
+    # Only integers are compressed as differences, because floats would not become smaller.
     with tifffile.TiffFile(tmp_path / "out.tif") as file:
         assert file.pages.first.predictor == (2 if dtype is np.uint16 else 1)
 
@@ -195,7 +195,7 @@ def test_a_tile_without_known_pixels_costs_no_inference(
 def test_openvino_gives_the_numbers_of_onnxruntime(
     dtype: type, most_dn: float, model: Path, tmp_path: Path
 ) -> None:
-    """An INT8 network gives the same, a float one nearly."""
+    """An INT8 network gives the same numbers, a float one nearly the same."""
     pytest.importorskip("openvino")
     pixels = np.concatenate([noise(70, 83), np.linspace(0, 4095, 4150).reshape(50, 83)])
     network = shipped_pair()[1] if dtype is np.uint16 else model
@@ -206,11 +206,12 @@ def test_openvino_gives_the_numbers_of_onnxruntime(
     assert row.text["runtime"].startswith("openvino")
 
 
-def test_openvino_gives_them_on_processors_whose_kernels_saturate_too(
+def test_openvino_gives_the_same_on_processors_whose_kernels_saturate(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The network is rewritten as on such a processor; the image has the two extreme values, whose
-    sums are largest.
+    """The network is rewritten as on such a processor.
+
+    The image has only the two extreme values, which give the largest sums.
     """
     pytest.importorskip("openvino")
     image = np.random.default_rng(3).integers(0, 2, (1, 1, 41, 67)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The workers of a Dask scheduler give the bytes of a run without them, even if some die."""
+"""Tests that workers of a Dask scheduler give the bytes of a run without them, even if some die."""
 
 import os
 import signal
@@ -54,7 +54,7 @@ def image(tmp_path: Path) -> Path:
 
 
 def both(folder: Path, scheduler: str, **options: Any) -> tuple[bytes, bytes]:
-    """Return the bytes of one process, and those of two workers."""
+    """Return the bytes that one process writes, and those with two workers."""
     one = folder / "one.tif"
     two = folder / "two.tif"
     restore(folder / "in.tif", one, **options)
@@ -86,7 +86,7 @@ def test_two_workers_restore_each_band_for_its_own_sensor(scheduler: str, tmp_pa
 def test_two_workers_run_int8_and_the_networks_of_users(
     make: Callable[[], onnx.ModelProto], scheduler: str, tmp_path: Path
 ) -> None:
-    """With a larger result, and with several bands."""
+    """The networks of users have a larger result, or several bands."""
     (tmp_path / "in").mkdir()
     save_onnx(make(), tmp_path / "network.onnx")
     bands = tiling_of(load_onnx(tmp_path / "network.onnx")).channels_in
@@ -96,7 +96,7 @@ def test_two_workers_run_int8_and_the_networks_of_users(
     assert two == one
 
 
-def test_a_run_begun_here_is_finished_by_workers(
+def test_workers_resume_a_run_that_began_without_them(
     image: Path, model: Path, scheduler: str, tmp_path: Path
 ) -> None:
     run = partial(restore, network=model, tile=TILE_PX)
@@ -108,7 +108,7 @@ def test_a_run_begun_here_is_finished_by_workers(
     assert out.read_bytes() == (tmp_path / "expected.tif").read_bytes()
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no such signal")
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signal")
 def test_a_worker_that_is_killed_changes_nothing(
     image: Path, model: Path, local: Any, scheduler: str, tmp_path: Path
 ) -> None:
@@ -141,7 +141,7 @@ def call(
 
 
 def test_a_call_that_kills_its_workers_is_one_sentence() -> None:
-    """On workers of its own, because new ones take long to start."""
+    """The call has its own workers, because the others would take long to start again."""
     with (
         local_cluster(1) as local,
         pytest.raises(MachineError, match=r"died during the same call.*resume"),
@@ -168,7 +168,7 @@ def test_a_scheduler_whose_workers_left_is_one_sentence(monkeypatch: pytest.Monk
         call(local.scheduler_address, time.sleep, 60, meanwhile=lambda: local.scale(0))
 
 
-def test_nobody_at_the_address_and_no_workers_are_one_sentence(
+def test_a_wrong_address_and_a_lack_of_workers_are_one_sentence(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(cluster, "ANSWER_S", 0.5)

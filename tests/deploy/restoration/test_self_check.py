@@ -1,4 +1,4 @@
-"""The self-check of `restore`: what it reports, refuses and writes."""
+"""Tests of the self-check of `restore`: its report, its errors and its map."""
 
 import logging
 from collections.abc import Sequence
@@ -44,7 +44,7 @@ def run(image: Path, out: Path, **options: Any) -> Row:
     return rows[0]
 
 
-def test_a_right_restoration_is_within_the_bound_and_its_map_lies_over_the_image(
+def test_a_right_restoration_is_within_the_bound_and_its_map_is_georeferenced(
     image: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A right restoration passes even with `strict`, and its map is georeferenced block by block.
@@ -76,7 +76,7 @@ def test_a_right_restoration_is_within_the_bound_and_its_map_lies_over_the_image
     assert row.figures["self-check not decidable"].value == pytest.approx(undecided)
 
 
-def test_a_network_for_another_sensor_is_found(
+def test_a_network_for_another_sensor_is_reported(
     image: Path, other_network: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A network for a sharper sensor fails the check: a warning, and with `strict` an error.

@@ -1,4 +1,4 @@
-"""An image is compared with its sensor: a wrong sensor leads to a warning, or to an error."""
+"""Tests that a sensor that contradicts the image gives a warning, or an error with `strict`."""
 
 import re
 import time
@@ -21,7 +21,7 @@ SENSOR = Sensor.load(NAME)
 
 @pytest.fixture(scope="module")
 def raw() -> np.ndarray:
-    """A raw image (320, 320), of drawn fields and houses."""
+    """Return a raw image (320, 320) of drawn fields and houses."""
     pair = bd.simulate(sensor=SENSOR, size=320, seed=3)
     assert isinstance(pair, bd.Pair)
     return pair.degraded
@@ -36,13 +36,13 @@ def check(
     return check_source(source_of(image, nodata), [sensor], full_scale)
 
 
-def test_the_true_sensor_is_found_again(raw: np.ndarray) -> None:
+def test_the_true_sensor_agrees_with_its_image(raw: np.ndarray) -> None:
     result = check(raw)
     assert result.warnings == ()
     assert result.text == {"sensor check": "agrees"}
     low, high = result.figures["measured SNR"].interval or (0, 0)
     assert 0 < high - low < 0.5 * high
-    # Left-justified, and with missing pixels of any value: the same image of the same sensor.
+    # A left-justified image, and one with missing pixels of any value, agree as well.
     assert (
         check(raw * 16, full_scale=16 * 4095).figures["measured SNR"].value
         == result.figures["measured SNR"].value

@@ -1,6 +1,4 @@
-"""STAC items are valid by the core schema and by the fields of their extensions. They have the
-place of the image, what was done, and the network by its digest.
-"""
+"""Tests that STAC items are valid, and state the place, the processing and the network's digest."""
 
 import json
 import re
@@ -37,13 +35,13 @@ PROCESSING = {
     "patternProperties": {"^(?!processing:)": {}},
     "additionalProperties": False,
 }
-"""The fields that are used of version 1.2.0 of the processing extension, by its README."""
+"""The fields of the processing extension 1.2.0 that are used, as its README defines them."""
 
 
 def require_valid(content: dict[str, Any]) -> None:
     """Check an item by the schemas that pystac brings, and by the fields of processing.
 
-    The schemas of extensions are on the network.
+    The schemas of the extensions are not used, because they must be fetched.
     """
     validation.validate_dict(content, extensions=[])
     for fields in (content["properties"], *content["assets"].values(), *content["links"]):
@@ -91,8 +89,8 @@ def test_an_item_needs_its_package(
     assert names(tmp_path) == ["in.tif"]
 
 
-def test_an_item_tells_how_the_image_was_made(tmp_path: Path) -> None:
-    """A shipped network is made for the sensor, so it is written: its digest is that of the run."""
+def test_an_item_states_how_the_image_was_restored(tmp_path: Path) -> None:
+    """A shipped network is built for the sensor, so its file is written. The run has its digest."""
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
     options = "--network convbeers-xs-int8 --sensor pleiades-degraded --self-check"
     content = restored_item(image, tmp_path / "out.json", f"{options} {tmp_path}/blocks.tif")
@@ -103,8 +101,11 @@ def test_an_item_tells_how_the_image_was_made(tmp_path: Path) -> None:
     # The image is noise, which no sensor sees.
     assert "self-check outside: 100 %" in about["processing:lineage"]
     assert content["assets"]["self-check"]["href"] == "blocks.tif"
-    made = content["assets"]["restored"]
-    assert made["processing:expression"] == {"format": "stac-mlm", "expression": "out-network.json"}
+    expression = content["assets"]["restored"]["processing:expression"]
+    assert expression == {
+        "format": "stac-mlm",
+        "expression": "out-network.json",
+    }
     assert [link["href"] for link in content["links"]] == ["out-network.json"]
     network = network_item(tmp_path / "out-network.json")
     asset = network.assets["model"]
@@ -122,8 +123,8 @@ def network_item(path: Path) -> Any:
     """
     content = json.loads(path.read_text())
     validation.validate_dict(content, extensions=[])
-    # The extension's schema has these rules besides the fields that it requires, which pystac
-    # refuses to read where they are missing.
+    # These are the other rules of the extension's schema. pystac itself refuses an item that lacks
+    # a required field.
     assert any("mlm:model" in asset["roles"] for asset in content["assets"].values())
     assert "mlm:pretrained_source" not in content["properties"]
     item = pystac.Item.from_dict(content)
@@ -136,8 +137,8 @@ def network_item(path: Path) -> Any:
     return item
 
 
-def test_a_network_with_a_file_is_referred_to_where_it_lies(model: Path, tmp_path: Path) -> None:
-    """A name that the extension does not accept is not claimed, nor an architecture."""
+def test_a_network_with_a_file_is_linked_where_it_is(model: Path, tmp_path: Path) -> None:
+    """The extension does not accept the name 1, so that the item has a general name."""
     own = tmp_path / "networks" / "1.onnx"
     own.parent.mkdir()
     own.write_bytes(model.read_bytes())
@@ -157,8 +158,8 @@ def test_each_sensor_has_a_network_and_the_traditional_pipeline_has_none(tmp_pat
     names = ["a-network-1.json", "a-network-2.json"]
     assert content["assets"]["restored"]["processing:expression"]["expression"] == names
     items = [network_item(tmp_path / name) for name in names]
-    told = [mlm.MLMExtension.ext(item).hyperparameters.to_dict()["sensor"] for item in items]
-    assert told == ["pleiades-degraded", "blind"]
+    stated = [mlm.MLMExtension.ext(item).hyperparameters.to_dict()["sensor"] for item in items]
+    assert stated == ["pleiades-degraded", "blind"]
 
     small = images.write_tiff(tmp_path / "small.tif", np.ascontiguousarray(pixels[:, :24, :24]))
     how = "--method traditional --quality fast --sensor pleiades-degraded --overwrite"

@@ -1,6 +1,4 @@
-"""The two steps around a network, end to end: exact seams, the switches, and what each step
-changes.
-"""
+"""Tests of the two steps around a network: exact seams, switches, and the change by each step."""
 
 import json
 from collections.abc import Callable
@@ -54,7 +52,7 @@ def image() -> np.ndarray:
 
 @cache
 def lacking() -> np.ndarray:
-    """Return the same with missing pixels, an area of them across tiles, and saturated ones."""
+    """Return `image` with saturated pixels and with missing ones, which extend across tiles."""
     pixels = image().copy()
     pixels[60:110, 40:90] = NODATA
     pixels[[3, 77, 128], [5, 120, 140]] = NODATA
@@ -68,7 +66,7 @@ def as_floats(pixels: np.ndarray) -> np.ndarray:
 
 
 DEFAULTS: dict[str, Any] = {"sensor": SENSOR, "full_scale": 4095}
-"""Options of each restoration that names no others."""
+"""Options of a restoration, unless it names others."""
 
 
 def by_array(pixels: Any, network: str | Path, **options: Any) -> Any:
@@ -79,7 +77,7 @@ def by_array(pixels: Any, network: str | Path, **options: Any) -> Any:
 def by_file(
     folder: Path, pixels: np.ndarray, layout: dict[str, Any] | None = None, **options: Any
 ) -> np.ndarray:
-    """Restore a file, `layout` of which is what tifffile takes."""
+    """Restore a file. `layout` contains options of tifffile."""
     tags = (layout or {}) | (marked(NODATA) if pixels.dtype == np.uint16 else {})
     return restored(folder, pixels, tags, **{**DEFAULTS, **options})[0]
 
@@ -88,8 +86,9 @@ def by_file(
 def test_tiles_and_files_give_the_whole_image_s_pixels(
     name: str, floats: bool, model: Path, tmp_path: Path
 ) -> None:
-    """The pixels are the same bit for bit, with both steps, missing and saturated pixels; for the
-    network of a user without exposures.
+    """The pixels are the same bit for bit, with both steps and with missing and saturated pixels.
+
+    The network of a user has no exposures.
     """
     name = name or str(model)
     pixels = as_floats(lacking()) if floats else lacking()
@@ -120,7 +119,7 @@ def test_a_dask_array_gives_the_same_and_its_workers_read_no_files(
 
 
 @pytest.mark.parametrize("sensors", [(SENSOR, NOISY), (Sensor.load(BLIND), SENSOR)])
-def test_each_band_takes_the_steps_of_its_own_sensor(
+def test_each_band_is_restored_with_the_steps_of_its_own_sensor(
     sensors: tuple[Sensor, Sensor], tmp_path: Path
 ) -> None:
     """The sensor of one band has other factors, or is not known."""
@@ -169,7 +168,7 @@ OTHER: list[dict[str, Any]] = [
     {"network": FLOAT},
     {"fix_detectors": "found"},
 ]
-"""Options of which each makes other pixels."""
+"""Options, each of which changes the pixels."""
 
 
 def test_a_run_is_not_resumed_with_other_options(tmp_path: Path) -> None:
@@ -187,9 +186,7 @@ BRIGHTENED = "brightened pixels"
 
 
 @pytest.mark.parametrize(("consistency", "exposure"), [(True, False), (False, True)])
-def test_the_command_reports_which_steps_were_taken(
-    consistency: bool, exposure: bool, tmp_path: Path
-) -> None:
+def test_the_command_reports_the_steps(consistency: bool, exposure: bool, tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", image())
     switches = {"consistency": consistency, "exposure": exposure}
     words = [f"--no-{name}" for name, is_on in switches.items() if not is_on]
@@ -235,7 +232,7 @@ def test_each_step_changes_what_it_is_for() -> None:
 
 
 def test_points_of_light_are_corrected_in_int8_as_far_as_in_float() -> None:
-    """Their corrections exceed what INT8 represents at the factor 1."""
+    """Without other exposures INT8 cannot represent their corrections."""
     light = np.full(SHAPE, 300.0)
     light[60, 70] = 8000
     light[90:92, 50:52] = 2700
@@ -257,7 +254,7 @@ def test_points_of_light_are_corrected_in_int8_as_far_as_in_float() -> None:
         (partial(four_bands, 2), {"force": True}, "the network makes other pixels or bands"),
     ],
 )
-def test_where_the_consistency_step_cannot_be_taken_it_is_off(
+def test_the_consistency_step_is_off_if_it_is_not_possible(
     make: Callable[[], onnx.ModelProto] | None, options: dict[str, Any], reason: str, tmp_path: Path
 ) -> None:
     pixels = image()
@@ -292,9 +289,10 @@ def test_the_mean_of_a_dark_image_is_kept() -> None:
     assert abs(with_steps - 1) < 0.003 < 0.02 < abs(without_steps - 1)
 
 
-def test_few_rows_are_held_of_a_tall_image(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The consistency step needs its reach above and below a row of tiles, and that reach ends
-    within two others.
+def test_few_rows_of_a_tall_image_are_held(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The consistency step needs its reach above and below a row of tiles.
+
+    That reach ends within two other rows of tiles.
     """
     most = [0]
     forget_above = HeldRows.forget_above

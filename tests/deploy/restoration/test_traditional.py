@@ -1,4 +1,4 @@
-"""The traditional pipeline gives of a file the pixels of the chain on the whole array."""
+"""Tests that the traditional pipeline restores a file to the pixels of the whole array."""
 
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,6 @@ from tests.deploy.restoration.runs import PLANES, marked, names, restored
 from tests.profiles.own_sensor import own_sensor
 
 SHAPE = (151, 67)
-
-
 SENSOR = Sensor.load("pleiades-degraded")
 
 
@@ -27,15 +25,15 @@ def noise(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(300, 1500, SHAPE).astype(np.uint16)
 
 
-def of_array(pixels: np.ndarray, sensor: Sensor = SENSOR) -> np.ndarray:
-    chain = TraditionalPipeline(sensor.nominal(), sensor.reference.nominal())
-    return restore_traditional(torch.from_numpy(pixels.astype(np.float32)), chain).numpy()
+def restore_array(pixels: np.ndarray, sensor: Sensor = SENSOR) -> np.ndarray:
+    pipeline = TraditionalPipeline(sensor.nominal(), sensor.reference.nominal())
+    return restore_traditional(torch.from_numpy(pixels.astype(np.float32)), pipeline).numpy()
 
 
-def of_file(
+def restore_file(
     folder: Path, pixels: np.ndarray, tags: dict[str, Any] | None = None, **options: Any
 ) -> np.ndarray:
-    """Restore pixels by way of files, for the sensor of the tests if `options` name no other."""
+    """Write pixels to a file and restore it, by default for the sensor of the tests."""
     chosen = {"method": "traditional", "sensor": SENSOR, **options}
     result, row = restored(folder, pixels, tags, **chosen)
     assert row.text["method"] == "traditional"
@@ -44,19 +42,19 @@ def of_file(
 
 
 def other_sensor(folder: Path) -> Path:
-    """Return the file of a sensor of another gain, and of 14 bits."""
+    """Return the file of a sensor with another gain and 14 bits."""
     return own_sensor(
         folder, ("bits = { value = 12", "bits = { value = 14"), ("value = 10.2375", "value = 40.0")
     )
 
 
 def test_a_file_gives_the_pixels_of_the_array(tmp_path: Path) -> None:
-    expected = of_array(noise())
-    result = of_file(tmp_path, noise(), {"rowsperstrip": 16, "compression": "zlib"})
+    expected = restore_array(noise())
+    result = restore_file(tmp_path, noise(), {"rowsperstrip": 16, "compression": "zlib"})
     assert_array_equal(result, np.rint(expected).astype(np.uint16))
     by_array = restore(noise(), method="traditional", sensor=SENSOR)
     assert_array_equal(by_array, result)
-    floats = of_file(tmp_path, noise().astype(np.float32))
+    floats = restore_file(tmp_path, noise().astype(np.float32))
     assert_array_equal(floats, expected)
     # The pipeline changes the image by more than rounding.
     assert np.abs(expected - noise()).mean() > 10
@@ -65,29 +63,29 @@ def test_a_file_gives_the_pixels_of_the_array(tmp_path: Path) -> None:
 def test_missing_pixels_stay(tmp_path: Path) -> None:
     pixels = noise()
     pixels[20:40, 5:9] = 7
-    assert_array_equal(of_file(tmp_path, pixels, marked(7)) == 7, pixels == 7)
+    assert_array_equal(restore_file(tmp_path, pixels, marked(7)) == 7, pixels == 7)
     with_nan = np.where(pixels == 7, np.nan, pixels).astype(np.float32)
-    assert_array_equal(of_file(tmp_path, with_nan), of_array(with_nan))
+    assert_array_equal(restore_file(tmp_path, with_nan), restore_array(with_nan))
 
 
 def test_bands_are_restored_one_by_one_each_for_its_sensor(tmp_path: Path) -> None:
     bands = np.stack([noise(0), noise(1)])
     for sensors in ({"": SENSOR}, {"B1": SENSOR, "B2": Sensor.load("dior-medium")}):
-        results = of_file(tmp_path, bands, PLANES, sensor=sensors)
+        results = restore_file(tmp_path, bands, PLANES, sensor=sensors)
         for band, pixels in enumerate(bands):
             sensor = list(sensors.values())[band % len(sensors)]
-            expected = of_array(pixels, sensor)
+            expected = restore_array(pixels, sensor)
             assert_array_equal(results[band], np.rint(expected).astype(np.uint16))
 
 
 def test_the_output_has_the_scale_of_the_input_whatever_the_gain(tmp_path: Path) -> None:
     (tmp_path / "files").mkdir()
     flat = np.full(SHAPE, 8000, np.uint16)
-    result = of_file(tmp_path / "files", flat, sensor=other_sensor(tmp_path))
+    result = restore_file(tmp_path / "files", flat, sensor=other_sensor(tmp_path))
     assert abs(float(result.mean()) / 8000 - 1) < 0.01
     shares = (noise() / 4095).astype(np.float32)
-    result = of_file(tmp_path / "files", shares, full_scale=1.0)
-    assert_allclose(result * 4095, of_array(noise()), atol=0.5)
+    result = restore_file(tmp_path / "files", shares, full_scale=1.0)
+    assert_allclose(result * 4095, restore_array(noise()), atol=0.5)
 
 
 @pytest.mark.parametrize(
@@ -103,7 +101,7 @@ def test_what_it_cannot_restore_leaves_the_old_output(
 ) -> None:
     (tmp_path / "out.tif").write_bytes(b"the old one")
     with pytest.raises(ImageError, match=words):
-        of_file(tmp_path, pixels)
+        restore_file(tmp_path, pixels)
     assert (tmp_path / "out.tif").read_bytes() == b"the old one"
     assert names(tmp_path) == ["in.tif", "out.tif"]
 
@@ -112,11 +110,11 @@ def test_the_command_needs_a_sensor(tmp_path: Path) -> None:
     image = tmp_path / "in.tif"
     out = tmp_path / "out.tif"
     tifffile.imwrite(image, noise())
-    chain = f"restore {image} {out} --method traditional"
+    command = f"restore {image} {out} --method traditional"
     needed = "--method traditional needs --sensor, the sensor that acquired the image"
-    assert needed in refused(chain)
-    assert "hubble" in refused(f"{chain} --sensor hubble")
+    assert needed in refused(command)
+    assert "hubble" in refused(f"{command} --sensor hubble")
     assert not out.exists()
-    done(f"{chain} --sensor {other_sensor(tmp_path)} --json {tmp_path}/a.json")
+    done(f"{command} --sensor {other_sensor(tmp_path)} --json {tmp_path}/a.json")
     assert tifffile.imread(out).shape == SHAPE
     assert '"sensor": "mine"' in (tmp_path / "a.json").read_text()

@@ -1,4 +1,4 @@
-"""Masks and alpha mark missing pixels and are copied; other pixels than plain light are refused."""
+"""Tests that masks and alpha mark missing pixels, and that pixels other than light are refused."""
 
 import logging
 import warnings
@@ -39,7 +39,7 @@ def restored(path: Path, model: Path, **options: Any) -> tuple[np.ndarray, np.nd
 
 
 def by_nodata(folder: Path, pixels: np.ndarray, model: Path) -> np.ndarray:
-    """Return the same image restored, whose hidden pixels have a nodata value that no other has."""
+    """Restore the image with a nodata value in its hidden pixels only."""
     hidden = np.where(HIDDEN, NODATA, np.where(pixels == NODATA, NODATA + 1, pixels)).astype(
         pixels.dtype
     )
@@ -54,17 +54,17 @@ def pixels_of_test() -> np.ndarray:
     return pixels
 
 
-@pytest.mark.parametrize(("beside", "cog"), [(False, False), (True, False), (True, True)])
+@pytest.mark.parametrize(("is_sidecar", "cog"), [(False, False), (True, False), (True, True)])
 def test_a_mask_marks_missing_pixels_and_is_copied(
-    beside: bool, cog: bool, model: Path, tmp_path: Path
+    is_sidecar: bool, cog: bool, model: Path, tmp_path: Path
 ) -> None:
     pixels = pixels_of_test()
     with tifffile.TiffWriter(tmp_path / "in.tif") as file:
         file.write(pixels, metadata=None)
-        if not beside:
+        if not is_sidecar:
             layout: dict[str, Any] = {"tile": (16, 32), "compression": "zlib", "metadata": None}
             file.write(~HIDDEN, subfiletype=4, photometric="mask", **layout)
-    if beside:
+    if is_sidecar:
         formats.write_mask(tmp_path / "in.tif", ~HIDDEN)
     result, result_mask = restored(tmp_path / "in.tif", model, cog=cog)
     assert_array_equal(result[HIDDEN], pixels[HIDDEN])
@@ -75,11 +75,11 @@ def test_a_mask_marks_missing_pixels_and_is_copied(
 
 def test_sidecar_files_of_gdal_count(model: Path, tmp_path: Path) -> None:
     image = tmp_path / "in.tif"
-    beside = tmp_path / "in.tif.aux.xml"
+    auxiliary = tmp_path / "in.tif.aux.xml"
     pixels = np.where(HIDDEN, NODATA, pixels_of_test()).astype(np.uint16)
     tifffile.imwrite(image, pixels)
     band = "<PAMDataset><PAMRasterBand band='1'>{}</PAMRasterBand></PAMDataset>"
-    beside.write_text(band.format("<NoDataValue>7</NoDataValue>"))
+    auxiliary.write_text(band.format("<NoDataValue>7</NoDataValue>"))
     assert_array_equal(restored(image, model)[0], by_nodata(tmp_path, pixels, model))
     with tifffile.TiffFile(tmp_path / "out.tif") as file:
         assert file.pages.first.tags[42113].value == "7"
@@ -87,10 +87,10 @@ def test_sidecar_files_of_gdal_count(model: Path, tmp_path: Path) -> None:
         (band.format("<Offset>500</Offset>"), "0 is no light"),
         ("<", "as GDAL writes"),
     ):
-        beside.write_text(text)
+        auxiliary.write_text(text)
         with pytest.raises(ImageError, match=words):
             restored(image, model)
-    beside.unlink()
+    auxiliary.unlink()
     tifffile.imwrite(tmp_path / "in.tif.msk", HIDDEN)
     with pytest.raises(ImageError, match="so that GDAL does not read it"):
         restored(image, model)
@@ -188,11 +188,12 @@ def linear(path: Path, factor: float, offset: float) -> Path:
 
 @pytest.mark.parametrize("sensor", [BLIND, "pleiades-degraded"])
 @pytest.mark.parametrize("how", [(0.0, 0.3), (1.0, 0.6), (400.0, -136.8)])
-def test_a_result_that_no_restoration_has_is_refused(
+def test_an_implausible_result_is_refused(
     tmp_path: Path, how: tuple[float, float], sensor: str
 ) -> None:
-    """A constant result, one that is far brighter, and one that is half 0 and half full scale.
-    The consistency step, which is taken with a sensor, does not hide it.
+    """The results are constant, far brighter, or half 0 and half full scale.
+
+    With a sensor the consistency step follows, which must not hide this.
     """
     rows, columns = np.mgrid[:61, :83]
     tifffile.imwrite(tmp_path / "in.tif", (900 + 10 * rows + 5 * columns).astype(np.uint16))
