@@ -1,6 +1,4 @@
-"""What is installed is one package: `beers_deploy` is deploy/, with model/, quant/ and profiles/
-inside it.
-"""
+"""Install one package: `beers_deploy` is deploy/, with model/, quant/ and profiles/ inside it."""
 
 from os import umask
 from shutil import rmtree

@@ -40,7 +40,7 @@ PACKED = {
     "nested_conditionals": "nested conditional expressions: write an if statement",
     "double_comprehensions": "comprehensions of two loops: write one loop out",
 }
-"""What no file may contain, by the field of Counts, and what to do instead."""
+"""Code that no file may contain, by the field of Counts, and the remedy."""
 
 
 class Counts(NamedTuple):

@@ -76,7 +76,7 @@ JUDGED = {
 }
 RADIANCES = (1.0, 0.25, 0.05)
 BRIGHTNESS = (0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1)
-"""Of pixels, over full scale, for the table."""
+"""Limits of the pixels' brightness in the table, as shares of full scale."""
 
 
 @dataclass(frozen=True)

@@ -221,8 +221,7 @@ NETWORKS: dict[str, tuple[str, Callable[[], nn.Module]]] = {
     "RFDN": ("dncnn", RFDN),
     "NAF-like": ("dncnn", gated),
 }
-"""By name, the task that each network learns (`examples.samples`) and the function that makes
-it."""
+"""The task that each network learns (`examples.samples`) and the function that builds it."""
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,9 @@ from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.quant.session import open_session, run
 
 MAX_DIFFERENCE = 1e-5
-"""As a share of full scale: a twentieth of a digital number, more than float32 summation order
-explains.
+"""Share of full scale: a twentieth of a digital number.
+
+That is more than the order of sums in float32 explains.
 """
 
 

@@ -20,29 +20,33 @@ from beers_deploy.dpu.cost.model import NAMES, Array, Constants, Layers, Structu
 from benchmarks.cost_model.published import Case
 
 START = Constants(0.8, 40, 0.55, 6e-6, 5e-5, 0.4e9, 0.8e9, 0.3e9, 30e6, 60e6, 1.3e9)
-"""Where the fit begins: the right orders of magnitude; a pixel of an image takes the host a clock
-cycle.
+"""The fit begins at these values of the right order of magnitude.
+
+The host is assumed to need a clock cycle for a pixel of an image.
 """
 DEVIATION = np.array([0.3, 1, 0.2, 1, 1, 0.7, 0.7, 0.7, 1, 1, 0.5])
-"""How far each logarithm may lie from its start, a standard deviation: shares less than times and
-rates. Few networks tell what the VCK190's memory reaches, and they differ by 1.7: the other boards'
-0.5 to 0.65 count too.
+"""Standard deviation of each logarithm from its start, smaller for shares than for times and rates.
+
+Few networks determine the efficiency of the VCK190's memory, and they differ by 1.7. So the values
+of the other boards, 0.5 to 0.65, count too.
 """
 SOFT = 0.1
-"""Residual in ln(FPS) from where a rate counts linearly."""
+"""Residual in ln(FPS) above which a rate counts linearly."""
 ALONE = 0.25
 PEAK = NAMES.index("array_efficiency")
 STEP = 1e-5
-"""Of a logarithm, for slopes."""
+"""Difference of a logarithm for numerical slopes."""
 SHIFTS = np.outer((0.0, -0.4, 0.4), np.eye(len(NAMES))[NAMES.index("memory_efficiency")])
-"""Where the fit begins, from the start: where one part of a layer outruns another the cost has
-kinks, and the nearest low point need not be the lowest.
+"""Offsets from START at which further fits begin.
+
+The cost has kinks where one part of a layer becomes slower than another, so the nearest minimum
+need not be the lowest.
 """
 ENOUGH = 1e-5
 STUCK = 1e5
 MAX_STEPS = 200
-"""A step that gains less than this share of the cost is the last, and so is one that needs this
-much damping, or the one with this number: along a kink steps grow ever smaller.
+"""The fit ends if a step gains less than ENOUGH of the cost, needs the damping STUCK, or has the
+number MAX_STEPS, because along a kink steps become ever smaller.
 """
 
 

@@ -109,17 +109,17 @@ class Entry:
 
     @property
     def family(self) -> str:
-        """Networks of one family resemble one another."""
+        """Return the name of the family, whose networks resemble one another."""
         return self.header["family"]
 
     @property
     def host(self) -> Task | None:
-        """What the host does with the results; None where the rates are the DPU's alone."""
+        """Return the host's task with the results, or None if the rates are the DPU's alone."""
         return next((task for task in get_args(Task) if task == self.header["host"]), None)
 
     @property
     def operations(self) -> float:
-        """Published operations for one image, two a product."""
+        """Return the published operations for one image, two for a product."""
         return 1e9 * float(self.header["gop"])
 
 

@@ -1,11 +1,10 @@
-"""How wrong the cost model is about networks that its fit has not seen, and the intervals that
-follow.
+"""Estimate the error of the cost model on networks outside its fit, and the intervals that follow.
 
-Networks of one family resemble one another, so a family is left out as a whole. What is chosen and
-what is judged are selected apart by two rounds (nested cross-validation): for each family left out,
-`contention_exponent` is chosen, and the width of the interval computed, from errors on others of
-the families that remain. Boards of one processor share `contention_exponent`. The errors in the
-documents and the widths in [cost] come from `nested`.
+Networks of one family resemble one another, so a family is left out as a whole. The validation is
+nested, so that no family judges its own choices. For each family left out, `contention_exponent`
+and the width of the interval follow from the other families, each of which is left out in turn.
+Boards of one processor share `contention_exponent`. The errors in the documents and the widths in
+[cost] come from `nested`.
 """
 
 from collections import Counter, defaultdict
@@ -29,22 +28,24 @@ from benchmarks.cost_model.published import boards, host_cores, published_cases,
 CONTENTION_EXPONENTS = (2.0, 4.0)
 """The values among which the cross-validation chooses."""
 OVERLAP = {"DPUCZDX8G": 1.0, "DPUCVDX8G": 0.5, "DPUCV2DX8G": 0.5}
-"""By DPU.
+"""The overlap of computation and memory transfers, by DPU.
 
-The first does 94 % of its array's peak on a network of large maps (SESR, KV260), so its memory is
-hidden. Rates of the others do not tell: from 0 to 1, the error of families left out changes by 0.1
-points.
+The first reaches 94 % of its array's peak on a network of large maps (SESR, KV260), so its memory
+time is hidden. The rates of the others do not determine it: from 0 to 1, the error of families left
+out changes by 0.1 points.
 """
 FOLDS = 5
 SHARE = 0.9
-"""Of left-out families that the intervals hold."""
+"""The share of left-out families that the intervals contain."""
 CONFIDENCE = 0.75
-"""That they do: of some thirty families the luck of who is among them moves a mere quantile by
-several.
+"""The probability that they do.
+
+There are some thirty families, so chance would move a plain quantile by several of them.
 """
-DRAWN = 1
-"""A part's typical error is drawn to the mean error as by this many families whose rates follow
-that part alone.
+SHRINKAGE = 1
+"""A part's typical error is shrunk towards the mean error.
+
+The weight of the mean is that of this number of families whose rates follow that part alone.
 """
 
 
@@ -195,12 +196,12 @@ def widths_of(errors: Array, cases: Cases, shares: Array) -> Array:
     families = cases.families
     sizes = np.array([np.abs(rates).max() for rates in cases.rate_errors(errors)])
     overall = family_mean(sizes, families)
-    # A family counts once. A part that few rates follow is drawn to the mean of all families.
+    # A family counts once. A part that few rates follow is shrunk towards the mean of all families.
     weights = np.array([1 / np.sum(families == name) for name in families]) ** 0.5
-    drawn = DRAWN**0.5 * np.eye(len(PARTS))
+    shrunk = SHRINKAGE**0.5 * np.eye(len(PARTS))
     typical, _ = nnls(
-        np.concatenate([shares * weights[:, None], drawn]),
-        np.concatenate([sizes * weights, overall * drawn.sum(axis=1)]),
+        np.concatenate([shares * weights[:, None], shrunk]),
+        np.concatenate([sizes * weights, overall * shrunk.sum(axis=1)]),
     )
     return np.asarray(typical * family_quantile(sizes / (shares @ typical), families))
 
@@ -216,19 +217,17 @@ def family_mean(sizes: Array, families: NDArray[np.str_]) -> float:
 
 
 def family_quantile(errors: Array, families: NDArray[np.str_]) -> float:
-    """Return the size of error that SHARE of all families keep to with every one of
-    theirs, at CONFIDENCE.
-    """
+    """Return the error that SHARE of all families exceed with no network, at CONFIDENCE."""
     largest = sorted(np.abs(errors)[families == name].max() for name in set(families))
     return float(largest[tolerance_rank(len(largest)) - 1])
 
 
 def tolerance_rank(count: int) -> int:
-    """Which of `count` scores, sorted, SHARE of all families stay below, at CONFIDENCE; or the
-    last.
+    """Return the rank of the score, of `count` sorted ones, that bounds SHARE of all families.
 
-    The k-th of n does if fewer than k of n draws fall among that share: at a binomial probability
-    (S. S. Wilks, 1941, doi:10.1214/aoms/1177731788).
+    The k-th of n bounds them if fewer than k of n draws are among that share, which has a binomial
+    probability (S. S. Wilks, 1941, doi:10.1214/aoms/1177731788). If no rank reaches CONFIDENCE, it
+    is the last one.
     """
     return min(int(binom.ppf(CONFIDENCE, count, SHARE)) + 1, count)
 

@@ -101,7 +101,7 @@ DECODINGS: dict[str, Any] = {
     "offset windows": offset_windows,
     "bank sum": bank_sum,
 }
-"""How the copies that a core writes of each channel are decoded, by the name in host.json."""
+"""Functions that decode the copies of each channel that a core writes, by the name in host.json."""
 
 
 def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What a network takes: predicted for the DPU, measured on this machine, published by the paper.
+"""Time and power of a network: predicted for the DPU, measured here, published by the paper.
 
 - `board`: a swath on the DPU, next to the traditional pipeline and the paper; `tables`: its rows;
 - `dry_run`: the time that a restoration would take, here and on a board;

@@ -1,7 +1,7 @@
-"""What networks take on this machine for a tile.
+"""Measure the time of networks for a tile on this machine.
 
-Networks are timed interleaved, so that whatever else runs here meets them alike; load and memory
-are reported with each time.
+Networks are timed interleaved, so that other programs affect them alike. Load and memory are
+reported with each time.
 """
 
 import statistics

@@ -42,10 +42,10 @@ from beers_deploy.profiles.target import TargetProfile
 TABLE = "bench"
 LAYERS = "layers"
 PIPELINE_TIME = "pipeline_s_per_mpx"
-"""In a target's [cpu]: time of the traditional pipeline for 10^6 pixels on all cores."""
+"""Key in a target's [cpu]: time of the traditional pipeline for 10^6 pixels on all cores."""
 PAPER = "ConvBEERS paper, table of the VCK190 benchmark, 13600 x 9016"
 PAPER_TARGET = "vck190"
-"""The board that the paper measured: its rows stand beside that one alone."""
+"""The board that the paper measured. The paper's rows appear only next to this board."""
 
 
 def predicted_rows(name: str, prediction: Prediction, swath: Swath) -> list[Row]:
@@ -77,9 +77,7 @@ def predicted_rows(name: str, prediction: Prediction, swath: Swath) -> list[Row]
 
 
 QUOTED = {"latency": "ms", "throughput": "fps"}
-"""Of the tables [published_latency_ms] and [published_throughput_fps]: the
-figure's name and unit.
-"""
+"""Name and unit of the figures in [published_latency_ms] and [published_throughput_fps]."""
 
 
 def quoted_rows(network: str, target: TargetProfile) -> list[Row]:

@@ -1,6 +1,6 @@
-"""How work is timed on this machine: a call with its power, several calls interleaved.
+"""Time calls on this machine: one call with its power, or several calls interleaved.
 
-Power is that of RAPL's counters: never a guess from a data sheet.
+Power is read from RAPL's counters, never guessed from a data sheet.
 """
 
 import time

@@ -308,9 +308,7 @@ def curves_svg(
 
 
 HISTOGRAM_PX = (358, 240)
-"""No wider than the screen of a telephone. A wider picture would be scaled down there, with its
-labels.
-"""
+"""The width fits the screen of a telephone, which would scale down a wider picture."""
 HISTOGRAM_FRAME = (0.225, 0.2, 0.72, 0.77)
 LABELS = 5
 MOST_BARS = 81

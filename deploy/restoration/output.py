@@ -1,4 +1,4 @@
-"""From the finished rows of a checkpoint to the restored TIFF, plain or cloud-optimised."""
+"""Write the finished rows of a checkpoint as the restored TIFF, plain or cloud-optimised."""
 
 import os
 from collections.abc import Mapping, Sequence

@@ -1,11 +1,10 @@
-"""How an image is cut into tiles with exact seams, and the cost of that, which is known before the
-run.
+"""Cut an image into tiles with exact seams, and compute the cost of that before the run.
 
 A tile is read with a halo of `halo_px` pixels around its retained part. If the halo is the
 network's receptive radius, the result is the same as for the whole image, bit for bit
-(`quant.tiling`). For a network with strides, tiles begin and end at multiples of its lattice. If
-the image is not a multiple of the lattice, the last tiles reach beyond it, and the image is
-extended there by copies of its last row and column.
+(`quant.tiling`). For a network with strides, tiles begin and end at multiples of its
+`alignment_px`. If the image is not such a multiple, the last tiles reach beyond it, and the image
+is extended there by copies of its last row and column.
 """
 
 from collections.abc import Iterator

@@ -52,7 +52,7 @@ MAPS = {
 """Titles of the rasters that may be written with an image."""
 
 NAME = re.compile(r"[a-zA-Z][a-zA-Z0-9_.\-\s]+[a-zA-Z0-9]")
-"""What the extension accepts as the name of a model."""
+"""The names of a model that the extension accepts."""
 
 SHA256 = "1220"
 """Multihash prefix of a SHA-256 of 32 bytes, as the file extension writes checksums."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 FILES = ("report.html", "float.onnx", "int8.onnx", "core.onnx", "restored.tif", "before-after.png")
-"""What a run leaves in its folder; core.onnx is the network in the board's encoding."""
+"""The files of a run. core.onnx is the network in the board's encoding."""
 
 GATE_PATCHES = 12
 STEPS = 6

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 PAGES = ("report.html", "report.json", "node-data.json")
-"""What --report writes into its folder."""
+"""The files that --report writes into its folder."""
 
 
 @verb

@@ -27,7 +27,7 @@ RANGE = "pleiades-variable"
 """The sensors of a network that is for no single one."""
 
 FILES = ("checkpoint.safetensors", "log.csv", "validation.csv", "validation.png")
-"""What a run leaves in its folder besides the weights."""
+"""The files of a run in addition to the weights."""
 
 BESIDE_RECIPE = {"out", "recipe", "images", "device", "resume", "progress"}
 """Parameters that a recipe does not state."""

@@ -1,4 +1,4 @@
-"""What makes a function a verb: its parameters are checked, and its table records the call."""
+"""Decorate a function as a verb: check its parameters, and record the call in its table."""
 
 import math
 import os
@@ -327,4 +327,4 @@ def _recorded(value: object) -> object:
 
 
 IN_MEMORY = "in memory"
-"""How a document names arrays and other values without a name."""
+"""The name of arrays and other values without a name in a document."""

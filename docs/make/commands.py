@@ -36,9 +36,9 @@ A board is {boards}, or your .toml file ([boards](boards.md)); where nothing is
 predicted also {npus}. A sensor is the name of a profile, or your .toml file ([sensors](sensor-profile.md)).
 """
 SEVERAL = 2
-"""Commands that have the same line for an option, from which on it is described once."""
+"""From this number of commands with the same line for an option, it is described once."""
 NAMED = ": name or .toml file"
-"""How boards and sensors are named, which the opening says once."""
+"""The naming of boards and sensors, which the opening explains once."""
 
 
 def reference() -> str:

@@ -33,7 +33,7 @@ SPELT: dict[Kind, tuple[str, ...]] = {
     "activation": ("Clip from 0 to 6", "Max with the zero point"),
     "other": ("every operator not named here",),
 }
-"""What decides the kind besides the operator's name."""
+"""Conditions of a kind in addition to the operator's name."""
 
 OPENING = """# Operators of the DPUs
 
@@ -49,8 +49,9 @@ map. Other nodes run on the board's processor: `check` fails and names what to u
 counts their time at the start and the end of a float network, and refuses the network elsewhere.
 """
 VARYING = re.compile(r"((?<=: )[^.:]+(?=\.)|\d+)")
-"""Where the text of a rule may differ between boards: a list up to the end of a sentence, or a
-number.
+"""The parts of a rule's text that may differ between boards.
+
+They are a list up to the end of a sentence, or a number.
 """
 
 

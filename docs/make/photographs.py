@@ -24,14 +24,14 @@ ZOOM = 3
 
 @dataclass(frozen=True)
 class View:
-    """What a picture shows of a photograph.
+    """A picture of parts of a photograph.
 
     Attributes:
-        file: of the photograph.
-        picture: of the assets.
+        file: the file name of the photograph.
+        picture: the file name in the assets.
         oversampling: pixels of the photograph for each pixel of the sensor.
         windows: (row, column) of the crops, in pixels of the sensor.
-        side_px: of a crop.
+        side_px: the side of a crop.
     """
 
     file: str

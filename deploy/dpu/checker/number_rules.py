@@ -73,9 +73,7 @@ def power_of_two(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def one_format(op: Operation, dpu: Dpu) -> Finding | None:
-    """Who writes a tensor and who reads it give it the same scale and zero point
-    ({documents[quantiser]}).
-    """
+    """All nodes give a tensor the same scale and zero point ({documents[quantiser]})."""
     faults = [
         f"{role} is {' and '.join(map(_words, formats))}" for role, formats in op.disputed.items()
     ]

@@ -93,7 +93,7 @@ def depthwise(placement: Placement, dpu: Dpu, tile_px: int) -> str:
 
 
 def float_islands(placement: Placement, dpu: Dpu, tile_px: int) -> str:
-    """What a quantised file leaves in float is computed in BF16 (Xilinx/ross-ai-assistant,
+    """Float nodes of a quantised file are computed in BF16 (Xilinx/ross-ai-assistant,
     vai-fe-args).
     """
     names = ", ".join(node.op.name for node in placement.nodes if is_island(node, placement))

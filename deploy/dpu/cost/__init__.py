@@ -1,4 +1,4 @@
-"""How long a network takes on a DPU, and at what power.
+"""Predict the time and the power of a network on a DPU.
 
 - `work`: what each layer computes and moves, counted from shapes;
 - `model`: the constants of a target's [cost], and the times of layers that follow;

@@ -19,8 +19,8 @@ from beers_deploy.dpu.graph import Operation
 from beers_deploy.model.consistency.step import PRODUCTS_PER_PX
 
 Task = Literal["copy", "argmax", "softmax", "sort", "image"]
-"""What the host does with the results: reads them and no more (copy); finds the best of classes
-(argmax, softmax); ranks boxes or key points (sort); makes pixels of them (image).
+"""The host's task with the results: it only reads them (copy), finds the best of classes (argmax,
+softmax), ranks boxes or key points (sort), or converts them to pixels (image).
 """
 TASKS = get_args(Task)
 
@@ -30,10 +30,10 @@ OPERATORS: dict[str, Task] = {
     "NonMaxSuppression": "sort",
     "TopK": "sort",
 }
-"""What tells the task in a file."""
+"""The operators in a file that determine the task."""
 
 BANDS = 4
-"""Most that an image has: red, green, blue and transparency or infrared."""
+"""Maximum number of bands of an image: red, green, blue and transparency or infrared."""
 
 
 def host_work(bytes_in: float, bytes_out: float, values: float, task: Task) -> Array:
@@ -146,12 +146,12 @@ FLOAT_BYTES = 4
 them).
 """
 INSTRUCTIONS = 20.0
-"""Of plain code for a value of a result: four loads, their weights, their sum and its address
-(assumed).
+"""Instructions of plain code for a value of a result: four loads, their weights, their sum and its
+address (assumed).
 """
 PRODUCT_INSTRUCTIONS = 2.0
-"""Of plain code for an operation: two loads, a product with its sum and a step of the loop count as
-two (assumed).
+"""Instructions of plain code for an operation: two loads, a product with its sum and a step of the
+loop count as two operations (assumed).
 """
 
 

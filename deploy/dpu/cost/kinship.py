@@ -1,4 +1,4 @@
-"""How far the runs of an owner's board correct the prediction of another network: by kinship.
+"""Correct the prediction of a network by runs of other networks on the user's board: by kinship.
 
 ln(given / predicted) of a run is the sum of what the runs of one board have in common, the networks
 of one kind of layers, the runs of one network, and the single run. The shares of the variance in
@@ -17,8 +17,8 @@ from beers_deploy.dpu.cost.work import FUSED
 from beers_deploy.dpu.graph import Operation
 
 SHARES = (0.15, 0.35, 0.25, 0.2)
-"""Of the variance: of the board and what bounds the rate; of the kinds of layers; of the network;
-of the network in one size on one configuration. What is left is the scatter of repeated runs.
+"""Shares of the variance: of the board and what bounds the rate; of the kinds of layers; of the
+network; of the network in one size on one configuration. The rest is the scatter of repeated runs.
 """
 
 

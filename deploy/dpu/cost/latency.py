@@ -1,13 +1,13 @@
-"""How long a network takes on the DPU, layer by layer, how far off that may be, and at what power.
+"""Predict the time of a network on the DPU layer by layer, with its interval, and the power.
 
 Counts come from `work` and `host`, the formula from `model`, constants and widths from the target's
-[cost], where `benchmarks/cost_model` writes what it finds on published networks. None of them is
-ConvBEERS: the paper's own figure is what the model is compared with, never what it is made from.
+[cost]. There `benchmarks/cost_model` writes the constants that it fits to published networks. None
+of them is ConvBEERS: the model is compared with the paper's figure, and never fitted to it.
 
-The interval is FPS e^-width to FPS e^width, so wide that nine of ten families of networks, each
-left out of the fit once, lie inside. Each part of an image's time has a width of its own, and the
-rate has their mean, weighed by how much it follows each; beyond all networks that were fitted it is
-no narrower than `width_outside` (docs/explanation/cost-model.md).
+The interval is FPS e^-width to FPS e^width. Nine of ten families of networks, each left out of the
+fit once, lie inside. Each part of an image's time has a width of its own, and the rate has their
+mean, weighted by the influence of each part. Beyond all fitted networks the interval is no narrower
+than `width_outside` (docs/explanation/cost-model.md).
 """
 
 import math
@@ -282,9 +282,7 @@ def predict(
 WIDTHS = {part: f"width_{part}" for part in (*PARTS, "outside")}
 """The key in [cost] of half the width of an interval, in ln(FPS), by the part of the time."""
 ROUNDED = 1e-3
-"""How far [cost] rounds the ends of the fitted range: the largest fitted
-network is not beyond it.
-"""
+"""Relative rounding of the fitted range in [cost], so that the largest fitted network is inside."""
 
 
 def _outside(core: Sequence[Operation], dpu: Dpu) -> tuple[str, ...]:

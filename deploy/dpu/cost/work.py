@@ -1,4 +1,4 @@
-"""What one image asks of the DPU's parts, operation by operation, counted from shapes alone."""
+"""Count the work of the DPU's parts for one image, operation by operation, from shapes alone."""
 
 import math
 from collections import Counter

@@ -161,8 +161,9 @@ class Trial:
 
     @property
     def chosen(self) -> np.ndarray:
-        """For each image the index in `SHARES` that is best on the images of other sites, (N,), so
-        that the choice does not see the image itself. A single site chooses for itself.
+        """Return the index in `SHARES` for each image, (N,), that is best on images of other sites.
+
+        So the choice does not use the image itself. A single site chooses for itself.
         """
         sites = np.asarray(self.sites)
         numbers = np.empty(len(sites), int)

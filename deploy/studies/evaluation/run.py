@@ -365,7 +365,7 @@ CAPTIONS = {
     "sweep": SWEEP_CAPTION,
     "": SITES_CAPTION,
 }
-"""By the beginning of a table's name; the first that fits counts."""
+"""Captions by the beginning of a table's name. The first one that fits is used."""
 NOTES = (
     "MTF at Nyquist is measured on restored slanted edges.",
     (
