@@ -47,7 +47,7 @@ class Outputs:
 
     Attributes:
         arrays: restored pixels, and the integers of INT8 files, by name.
-        figures: of the JSON of verbs, by verb and network.
+        figures: the figures in the JSON of verbs, by verb and network.
         digests: SHA-256 of the shipped INT8 files, as `export` writes them.
         layouts: pixels and metadata that `restore` writes, by the layout of its input.
         answers: exit code and message, by wrong call.

@@ -1,6 +1,4 @@
-"""Synthetic scenes: the boxes are the objects' own pixels, the sizes are those of real ones, the
-seed decides all.
-"""
+"""Tests that synthetic scenes have exact boxes, realistic sizes, and depend on the seed alone."""
 
 import math
 from collections.abc import Callable
@@ -36,8 +34,8 @@ def scenes() -> list[Scene]:
     return [synthetic_scene(np.random.default_rng(seed), 600, 701) for seed in range(12)]
 
 
-def whole(canvas: Canvas) -> Plot:
-    """Ground without a border of its own."""
+def unlimited(canvas: Canvas) -> Plot:
+    """Return a plot of unlimited size."""
     return Plot(canvas, turn(0, 0, 0), math.inf)
 
 
@@ -46,22 +44,22 @@ def whole(canvas: Canvas) -> Plot:
 def test_a_box_is_the_pixels_that_the_object_changed(kind: int, angle: float, seed: int) -> None:
     canvas = Canvas(400, 420, np.random.default_rng(seed))
     before = np.array(canvas._image)
-    assert whole(canvas).put(kind, SHAPES[kind](canvas.generator), 1.3, -2.1, angle, 0.0)
+    assert unlimited(canvas).put(kind, SHAPES[kind](canvas.generator), 1.3, -2.1, angle, 0.0)
     rows, columns = np.nonzero(np.array(canvas._image) != before)
     assert canvas.corners == [(columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)]
 
 
-def test_nothing_is_put_over_the_border_or_on_another_object() -> None:
+def test_no_object_is_put_across_a_border_or_on_another_object() -> None:
     canvas = Canvas(400, 400, np.random.default_rng(0))
     parts = tank(9.0, canvas.generator)
-    assert whole(canvas).put(3, parts, 0, 0, 0, 3.0)
-    assert not whole(canvas).put(3, parts, 18.2, 0, 0, 3.0)
-    assert not whole(canvas).put(3, parts, 45, 0, 0, 3.0)
+    assert unlimited(canvas).put(3, parts, 0, 0, 0, 3.0)
+    assert not unlimited(canvas).put(3, parts, 18.2, 0, 0, 3.0)
+    assert not unlimited(canvas).put(3, parts, 45, 0, 0, 3.0)
     assert not Plot(canvas, turn(25, 0, 0), 8.0).put(3, parts, 0, 0, 0, 3.0)
     assert len(canvas.corners) == len(canvas.classes) == 1
 
 
-def test_every_object_lies_within_and_has_the_size_of_its_kind(scenes: list[Scene]) -> None:
+def test_every_object_is_inside_and_has_the_size_of_its_kind(scenes: list[Scene]) -> None:
     for radiance, truth in scenes:
         assert radiance.shape == (600, 701)
         assert radiance.dtype == np.float32

@@ -1,6 +1,4 @@
-"""The detector learns, repeats itself, and its file says what the network says; the small one that
-is stored finds what is drawn.
-"""
+"""Tests of the detector's training and file, and of the small detector that is stored."""
 
 import numpy as np
 import onnxruntime as ort
@@ -27,7 +25,7 @@ SIDE_PX = 64
 
 
 def squares(seed: int) -> Picture:
-    """Two squares on grey, a bright one and a dark one, in the upper and the lower half."""
+    """Draw a bright square in the upper half and a dark one in the lower half, on grey."""
     generator = np.random.default_rng(seed)
     image = np.full((3, SIDE_PX, SIDE_PX), 128, np.uint8)
     corners = []
@@ -45,7 +43,9 @@ def trained() -> DetectorNetwork:
     return train_detector([squares(k) for k in range(16)], 2, recipe)
 
 
-def test_it_finds_what_it_never_saw_and_its_file_says_the_same(trained: DetectorNetwork) -> None:
+def test_it_finds_unseen_squares_and_its_file_gives_the_same(
+    trained: DetectorNetwork,
+) -> None:
     file = detector_to_onnx(trained, ("bright", "dark"), SIDE_PX, "").SerializeToString()
     session = ort.InferenceSession(file, providers=["CPUExecutionProvider"])
     for seed in range(100, 104):
@@ -72,7 +72,7 @@ def test_the_same_seed_gives_the_same_weights_and_another_gives_others() -> None
 
 
 @given(st.integers(0, 2**32))
-def test_turning_moves_the_boxes_with_the_image(seed: int) -> None:
+def test_symmetries_move_the_boxes_with_the_image(seed: int) -> None:
     picture = turned(squares(seed), np.random.default_rng(seed))
     for kind, value in enumerate((255, 0)):
         rows, columns = np.nonzero(picture.image[0] == value)
@@ -80,14 +80,14 @@ def test_turning_moves_the_boxes_with_the_image(seed: int) -> None:
         np.testing.assert_array_equal(picture.corners[kind], bounds)
 
 
-def test_the_stored_detector_has_our_classes_and_says_its_recipe() -> None:
+def test_the_stored_detector_states_our_classes_and_its_recipe() -> None:
     detector = open_detector(DETECTOR, 1)
     assert (detector.names, detector.size_px, detector.flag) == (CLASSES, 256, "")
     assert metadata(load_onnx(DETECTOR))["recipe"] == str(DetectorRecipe())
 
 
 @pytest.mark.slow
-def test_the_stored_detector_finds_most_of_what_it_never_saw() -> None:
+def test_the_stored_detector_finds_most_unseen_objects() -> None:
     pictures = [drawn_picture(256, 7, number) for number in range(6)]
     detector = open_detector(DETECTOR, 1)
     boxes = [

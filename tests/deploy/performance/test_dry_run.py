@@ -1,4 +1,4 @@
-"""`restore --dry-run` shows what `restore` would do, before any pixel is restored."""
+"""Tests that `restore --dry-run` shows what `restore` would do, without restoring a pixel."""
 
 import json
 import math

@@ -23,7 +23,7 @@ from beers_deploy.verbs.restore import restore
 
 
 def noise(*shape: int, seed: int = 1) -> np.ndarray:
-    """Digital numbers of 12 bits, uint16, none of them 0."""
+    """Return digital numbers of 12 bits, uint16, none of them 0."""
     return np.random.default_rng(seed).integers(1, 4096, shape).astype(np.uint16)
 
 

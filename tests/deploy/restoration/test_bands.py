@@ -1,4 +1,4 @@
-"""Each band of an image may have its own sensor, and so a network of its own."""
+"""Tests that each band of an image may have its own sensor, and so a network of its own."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Tests that the system's QGIS reads the restored COG and runs the example of a tool."""
+"""Tests that the system's QGIS reads the restored COG and runs our example of a tool."""
 
 import json
 import subprocess

@@ -29,7 +29,7 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def other_network(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A network for a sensor that is far sharper."""
+    """Return the file of a network for a far sharper sensor."""
     sharp = Sensor.load(NAME).replace(mtf_nyquist=0.15)
     path = tmp_path_factory.mktemp("network") / "other.onnx"
     bd.Network.load("convbeers-xs", sensor=sharp).save(path)

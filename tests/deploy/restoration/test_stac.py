@@ -90,7 +90,7 @@ def test_an_item_needs_its_package(
 
 
 def test_an_item_states_how_the_image_was_restored(tmp_path: Path) -> None:
-    """A shipped network is built for the sensor, so its file is written. The run has its digest."""
+    """A shipped network is built for the sensor, so it is written. The item has its digest."""
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
     options = "--network convbeers-xs-int8 --sensor pleiades-degraded --self-check"
     content = restored_item(image, tmp_path / "out.json", f"{options} {tmp_path}/blocks.tif")
