@@ -1,7 +1,7 @@
-"""A network written down layer by layer: shapes and bytes of weights, no values.
+"""Build a network layer by layer: shapes and bytes of weights, without values.
 
-Every method appends one operation and returns its result. Batch norms and activations right behind
-a convolution are fused into it by the DPU's compiler, so they are not written down.
+Every method appends one operation and returns its result. The DPU's compiler fuses batch norms and
+activations into the convolution before them, so they are left out.
 """
 
 import math
@@ -28,7 +28,7 @@ class Tensor:
 
     @property
     def channels(self) -> int:
-        """The number of channels."""
+        """Return the number of channels."""
         return self.shape[0]
 
 
@@ -41,7 +41,7 @@ class Written:
 
 
 class Builder:
-    """Builds a network, operation by operation."""
+    """A builder that appends operations to a network."""
 
     def __init__(self, height: int, width: int, channels: int = 3) -> None:
         self.image = Tensor("image", (channels, height, width))
@@ -142,7 +142,7 @@ class Builder:
         return self._append("Concat", "concat", (x, *others), (channels, *x.shape[1:]))
 
     def slice(self, x: Tensor, first: int, count: int) -> Tensor:
-        """`count` channels from `first` on, counted from 0."""
+        """Append a slice of `count` channels from `first` on, counted from 0."""
         _require_same((min(first + count, x.channels),), (first + count,))
         return self._append("Slice", "other", (x,), (count, *x.shape[1:]))
 

@@ -1,10 +1,10 @@
 """Fit the constants of the cost model to published rates.
 
-Least squares on ln(FPS) with a soft L1 loss (a rate far off counts linearly), each network weighing
-the same, by damped Gauss-Newton steps on the logarithms of the constants. Rates with several
-threads tell how much the DPU and the host get done side by side; those with one thread, which weigh
-ALONE as much, how long they take one after the other. A weak prior pulls each logarithm to its
-start. No array does more than its peak, so its efficiency ends at 1.
+The fit minimises squares of ln(FPS) with a soft L1 loss (a rate far off counts linearly) by damped
+Gauss-Newton steps on the logarithms of the constants. Each network has the same weight. Rates with
+several threads determine the throughput of the DPU and the host in parallel. Rates with one thread,
+with the weight ALONE, determine the time of both in sequence. A weak prior pulls each logarithm to
+its start. No array exceeds its peak, so its efficiency is at most 1.
 """
 
 from collections import Counter
@@ -67,9 +67,7 @@ def rounded(constants: Constants) -> Constants:
 
 @dataclass(frozen=True)
 class Times:
-    """Seconds of one image, (n,) each: the DPU with all its cores, with one core alone, one core of
-    the host.
-    """
+    """Seconds for one image, (n,) each: on all DPU cores, on one of them, and on one host core."""
 
     dpu_s: Array
     alone_s: Array
@@ -85,7 +83,7 @@ class Cases:
 
     @cached_property
     def layers(self) -> Layers:
-        """The layers of all networks, concatenated."""
+        """Return the layers of all networks, concatenated."""
         parts = [row.layers for row in self.rows]
         return Layers(
             *(
@@ -104,29 +102,32 @@ class Cases:
 
     @cached_property
     def families(self) -> NDArray[np.str_]:
-        """The family of each case."""
+        """Return the family of each case, (n,)."""
         return np.array([row.family for row in self.rows])
 
     @cached_property
     def host_cores(self) -> Array:
-        """Cores of the board's processor, (n,)."""
+        """Return the number of cores of the board's processor, (n,)."""
         return np.array([row.host_cores for row in self.rows], float)
 
     @cached_property
     def observed(self) -> Array:
-        """Mean ln(FPS) with several threads, (n,)."""
+        """Return the mean ln(FPS) with several threads, (n,)."""
         return np.array([np.log(row.fps).mean() for row in self.rows])
 
     @cached_property
     def observed_single(self) -> Array:
-        """Mean ln(FPS) with one thread, (n,); NaN where there is none."""
+        """Return the mean ln(FPS) with one thread, (n,), or NaN where no such rate is published."""
         return np.array(
             [np.log(row.fps_single).mean() if row.fps_single else np.nan for row in self.rows]
         )
 
     @cached_property
     def weights(self) -> Array:
-        """Weights of the rates with several and with one thread, (2 n,): a network counts once."""
+        """Return the weights of the rates with several threads and with one, (2 n,).
+
+        All cases of a network together count once.
+        """
         counts = Counter(row.network for row in self.rows)
         weights = np.array([1 / counts[row.network] for row in self.rows])
         return np.concatenate([weights, ALONE * weights * ~np.isnan(self.observed_single)])
@@ -165,8 +166,9 @@ class Cases:
         return -np.logaddexp(q * dpu, q * host) / q
 
     def residuals(self, constants: Constants) -> Array:
-        """ln(predicted / observed) with several and with one thread, (2 n,); 0 where nothing was
-        observed.
+        """Return ln(predicted / observed) with several threads and with one, (2 n,).
+
+        It is 0 where nothing was observed.
         """
         times = self.times(constants)
         single = -np.log(times.alone_s + times.host_s) - self.observed_single
@@ -177,8 +179,10 @@ class Cases:
         return self.residuals(constants)[: len(self.rows)]
 
     def rate_errors(self, errors: Array) -> list[Array]:
-        """ln(predicted / rate) of each case's rates with several threads, from the `errors` of
-        their means (n,).
+        """Return ln(predicted / rate) of each case's rates with several threads.
+
+        Args:
+            errors: ln(predicted / observed) of the mean rates, (n,).
         """
         centres = errors + self.observed
         return [centre - np.log(row.fps) for centre, row in zip(centres, self.rows, strict=True)]
@@ -193,8 +197,7 @@ class Cases:
 
 def fit(cases: Cases, near: Constants | None = None) -> Constants:
     """Return the constants that fit the rates best. The fit begins at `near`, or around START."""
-    # The cost has kinks where one part of a layer outruns another, so the nearest minimum need not
-    # be the lowest.
+    # The nearest minimum need not be the lowest (see SHIFTS).
     begins = [logs_of(near)] if near else [logs_of(START) + shift for shift in SHIFTS]
     minima = [_descend(cases, logs) for logs in begins]
     return from_logs(min(minima, key=lambda end: end[1])[0])
@@ -207,7 +210,7 @@ def _descend(cases: Cases, logs: Array) -> tuple[Array, float]:
     normal, downhill = _slope(cases, logs)
     for _ in range(MAX_STEPS):
         there = logs + np.linalg.solve(normal + damping * np.diag(np.diag(normal)), downhill)
-        # No array does more than its peak, so the logarithm of the efficiency ends at 0.
+        # No array exceeds its peak, so the logarithm of the efficiency ends at 0.
         there[PEAK] = min(there[PEAK], 0.0)
         new = _cost(cases, there)
         if new >= cost:

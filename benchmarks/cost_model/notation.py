@@ -1,4 +1,6 @@
-"""Networks as text: the notation of the `.net` files in `zoo/`, and its reader.
+"""Read networks from the `.net` files in `zoo/`.
+
+Their notation is:
 
     block basic c                  # a block has parameters, some with defaults: block down c s=2
         conv c | conv c | add x    # a line is steps, each reading the result of the step before
@@ -6,7 +8,7 @@
     network small
         family resnet                      # networks of one family resemble one another
         host   argmax              # what the host does with the results: copy argmax softmax
-                                   # sort image, or none, where the rates are the DPU's alone
+                                   # sort image, or none, if the rates are the DPU's alone
         gop    1.2                 # published operations (two a product), in 10^9
         source He et al. 2015      # where the layers are written
         image  224 224             # height, width, and channels if not 3
@@ -85,7 +87,7 @@ KINDS = {
     "classifiers": "classifiers",
     "inceptions": "classifiers",
 }
-"""The kind of the networks of each file."""
+"""The kind of the networks in each file."""
 SIZE = re.compile(r"\b(\d+)x(\d+)\b")
 FLAG = re.compile(r"\b(valid|ceil)\b")
 HEADER = ("family", "host", "gop", "source", "image")
@@ -93,7 +95,7 @@ HEADER = ("family", "host", "gop", "source", "image")
 
 @dataclass
 class Block:
-    """Lines under a name, and its parameters with the text of their defaults."""
+    """A named block: its lines, and its parameters with the text of their defaults."""
 
     parameters: dict[str, str]
     lines: list[str] = field(default_factory=list)
@@ -101,7 +103,7 @@ class Block:
 
 @dataclass
 class Entry:
-    """A network of a file: what it does, its header and its lines."""
+    """A network in a file: its kind, its header and its lines."""
 
     kind: str
     header: dict[str, str] = field(default_factory=dict)

@@ -1,12 +1,12 @@
-"""The published networks and their published rates, as cases for the fit.
+"""Read the published networks and their published rates, as cases for the fit.
 
-Layers stand in the `.net` files under `zoo/` (see `notation`), rates in `zoo/published.csv`: tables
-of AMD's model zoo (github.com/Xilinx/Vitis-AI), each row with the release and the line, row or
-record that prints it. A rate contains the host: images lie decoded in memory, then each thread runs
-mean and scale, DPU and post-processing for a batch (src/vai_library/benchmark). How many threads
-`fps` took is not stated; `fps_single` took one.
+The layers are in the `.net` files under `zoo/` (see `notation`), the rates in `zoo/published.csv`.
+They are from tables of AMD's model zoo (github.com/Xilinx/Vitis-AI), and each row states the
+release and the line, row or record that prints it. A rate includes the host: decoded images are in
+memory, and each thread runs mean and scale, DPU and post-processing for a batch
+(src/vai_library/benchmark). The number of threads of `fps` is not stated; `fps_single` is of one.
 
-What a host does follows from the post-processing in src/vai_library/xnnpp/src:
+The task of the host follows from the post-processing in src/vai_library/xnnpp/src:
 
 - softmax: exponentials of every class, then the best few (classification.cpp,
   ultrafast_postimp.cpp);
@@ -47,15 +47,15 @@ class Case:
     """A network on a configuration with its rates.
 
     Attributes:
-        network: its name.
-        family: networks of one family resemble one another.
-        configuration: of the DPU.
-        layers: what its layers take.
+        network: the name of the network.
+        family: the family, whose networks resemble one another.
+        configuration: the configuration of the DPU.
+        layers: the work of its layers.
         host: units of the host's work for one image (7,), see `host_work`.
-        host_cores: of the board's processor.
+        host_cores: the number of cores of the board's processor.
         fps: rates with several threads, one or more.
         fps_single: rates with one thread, perhaps none.
-        map_bytes: its largest result.
+        map_bytes: the size of its largest result.
     """
 
     network: str
@@ -83,9 +83,10 @@ def published_rates() -> list[dict[str, str]]:
 
 
 SLOWER = {"kv260": ("1.4", "2.0")}
-"""Releases whose image moved maps more slowly on a board: RCAN, SESR and ENet gained 27 to 42 %
-with the next, on the ZCU102 1 to 9 %. Who installs a board today meets the later ones, so these
-rates are in no fit.
+"""Releases whose image moved maps more slowly on a board.
+
+RCAN, SESR and ENet became 27 to 42 % faster with the next release, and 1 to 9 % on the ZCU102.
+Boards are installed with later releases today, so the fit leaves these rates out.
 """
 
 

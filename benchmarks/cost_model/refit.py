@@ -1,9 +1,9 @@
 """Refit the cost model: `python -m benchmarks.cost_model.refit` writes [cost] of every board with
 published rates.
 
-It prints what a family that the fit has not seen is off by, on each board: the table of
-docs/explanation/cost-model.md. `--check` writes nothing and says whether the profiles hold what the
-fit finds.
+It prints the errors on families that the fit has not seen, for each board: the table of
+docs/explanation/cost-model.md. `--check` writes nothing, and reports whether the profiles have the
+constants of the fit.
 """
 
 import argparse

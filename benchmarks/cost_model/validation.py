@@ -51,16 +51,16 @@ The weight of the mean is that of this number of families whose rates follow tha
 
 @dataclass(frozen=True)
 class LeftOut:
-    """The errors of a network on a configuration, its family left out.
+    """The errors of a network on a configuration, with its family left out of the fit.
 
     Attributes:
-        network: its name.
-        family: its family.
-        configuration: of the DPU.
-        on_host: whether the host sets its rate, by the prediction.
-        error: ln(predicted / observed), the observed rate being the geometric mean.
+        network: the name of the network.
+        family: the family of the network.
+        configuration: the configuration of the DPU.
+        on_host: whether the host limits the predicted rate.
+        error: ln(predicted / observed), where observed is the geometric mean of the rates.
         rates: ln(predicted / rate) of each published rate.
-        width: half that of the interval that was predicted, in ln(FPS).
+        width: half the width of the predicted interval, in ln(FPS).
     """
 
     network: str
@@ -73,13 +73,13 @@ class LeftOut:
 
     @property
     def held(self) -> float:
-        """The share of the published rates inside the interval."""
+        """Return the share of the published rates inside the interval."""
         return float(np.mean(np.abs(self.rates) <= self.width))
 
 
 @dataclass(frozen=True)
 class Nested:
-    """The outcome for a board: all networks left out in turn, and the width of each of PARTS."""
+    """The result for a board: each network left out once, and the width of each of PARTS."""
 
     rows: Sequence[LeftOut]
     cases: Cases
@@ -88,9 +88,7 @@ class Nested:
 
 @cache
 def nested(board: str) -> Nested:
-    """Leave each family out; choose and make widths from the others alone; predict what was left
-    out.
-    """
+    """Predict each family with a contention exponent, constants and widths from the others."""
     names = _trial(board, chosen(board)).names
     predicted = [_trial(board, chosen(board, name)).left_out(name) for name in names]
     trial = _trial(board, chosen(board))
@@ -103,12 +101,11 @@ def nested(board: str) -> Nested:
 
 @cache
 def chosen(board: str, left_out: str = "") -> float:
-    """Return the contention exponent of least mean error, over the boards of a board's processor
-    and all families but one.
+    """Return the contention exponent with the smallest mean error, for all boards of one processor.
 
     Args:
-        board: its name.
-        left_out: a family.
+        board: the name of a board with this processor.
+        left_out: a family that is not used.
     """
     similar = [other for other in boards() if host_cores(other) == host_cores(board)]
     scores = [
@@ -167,7 +164,7 @@ class Trial:
         ]
 
     def inner(self, left_out: str) -> tuple[Array, Cases, Array]:
-        """Errors and shares of all families but one, which no fit sees, by folds of the others."""
+        """Return cross-validated errors and shares of all families but one, which no fit sees."""
         training = self.cases.only(self.cases.families != left_out)
         errors = np.zeros(len(training.rows))
         shares = np.zeros((len(training.rows), len(PARTS)))
@@ -186,12 +183,13 @@ class Trial:
 
 
 def widths_of(errors: Array, cases: Cases, shares: Array) -> Array:
-    """Return the widths of PARTS, (6,), that hold every rate of SHARE of the families.
+    """Return the widths of PARTS, (6,), that contain every rate of SHARE of the families.
 
-    What counts of a case is its rate that lies farthest off. The typical errors of the parts, none
-    below 0, are those whose means, weighed by the shares, come nearest to these by least squares; a
-    family's score is its largest error over its typical one; the widths are the typical errors
-    times the score that SHARE of all families keep to.
+    1. The error of a case is that of its rate with the largest error.
+    2. The typical errors of the parts, none below 0, fit these errors by least squares with their
+       means, weighted by the shares.
+    3. The score of a family is its largest ratio of error to typical error.
+    4. The widths are the typical errors times the score that SHARE of all families do not exceed.
     """
     families = cases.families
     sizes = np.array([np.abs(rates).max() for rates in cases.rate_errors(errors)])
@@ -233,10 +231,10 @@ def tolerance_rank(count: int) -> int:
 
 
 def pair_width(board: str) -> float:
-    """Return the largest error of the logarithm of the ratio of two published rates, in SHARE of
-    pairs of one family.
+    """Return the error of the logarithm of the ratio of two rates that SHARE of the pairs of one
+    family do not exceed.
 
-    Each network predicted without itself; only rates that the DPU bounds.
+    Each network is predicted without itself. Only rates that the DPU limits are used.
     """
     trial = _trial(board, chosen(board))
     cases = trial.cases
@@ -261,8 +259,7 @@ def pair_width(board: str) -> float:
 def outside_width(cases: Cases, share: float = 0.25) -> float:
     """Return the error of the networks with the largest maps, predicted from the others.
 
-    The largest: above `share` of the largest map of a network that the DPU bounds. Only such are
-    predicted.
+    Only networks that the DPU limits are predicted, with a map above `share` of their largest one.
     """
     bound = ~hosts_of(cases.shares(fit(cases)))
     sizes = np.array([row.map_bytes for row in cases.rows])
@@ -272,8 +269,9 @@ def outside_width(cases: Cases, share: float = 0.25) -> float:
 
 
 def by_network(rows: Iterable[LeftOut], *, signed: bool = False) -> Array:
-    """Mean |predicted / published - 1| of each network, or with its sign, over its configurations
-    and rates.
+    """Return the mean |predicted / published - 1| of each network over configurations and rates.
+
+    With `signed` the errors keep their sign.
     """
     by_name: dict[str, list[float]] = {}
     for row in rows:
@@ -283,8 +281,9 @@ def by_network(rows: Iterable[LeftOut], *, signed: bool = False) -> Array:
 
 
 def coverage(rows: Sequence[LeftOut]) -> tuple[float, float]:
-    """Share of published rates inside their intervals, each network weighing the same; share of
-    families whole.
+    """Return the share of rates inside their intervals, and of families with all rates inside.
+
+    Each network has the same weight in the first share.
     """
     counts = Counter(row.network for row in rows)
     networks = sum(row.held / counts[row.network] for row in rows) / len(counts)
@@ -295,16 +294,16 @@ def coverage(rows: Sequence[LeftOut]) -> tuple[float, float]:
 
 
 def settled(rows: Sequence[LeftOut]) -> tuple[float, float]:
-    """Share of questions that the intervals settle, and of these the share answered rightly.
+    """Return the share of questions that the intervals decide, and the share of right decisions.
 
-    A question is whether a network reaches a rate, asked of rates from half the published one to
-    twice, evenly in logarithms. Each network weighs the same.
+    A question is whether a network reaches a rate. The rates are from half the published one to
+    twice, evenly spaced in logarithms. Each network has the same weight.
     """
     counts = Counter(row.network for row in rows)
     asked = np.linspace(-np.log(2), np.log(2), 401)
     shares = []
     for row in rows:
-        # Of a rate that was predicted too high by `rates`, asked at `asked` above the published.
+        # In logarithms the prediction is `rates` above the published rate, the question `asked`.
         far = np.abs(asked - row.rates[:, None]) > row.width
         right = far & ((asked > row.rates[:, None]) == (asked > 0))
         shares.append((far.mean() / counts[row.network], right.mean() / counts[row.network]))
@@ -314,13 +313,13 @@ def settled(rows: Sequence[LeftOut]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Corrected:
-    """Networks that one run of an owner corrects, by what they have in common.
+    """The correction of networks by one run of another network, for one kinship.
 
     Attributes:
-        pairs: run and network.
+        pairs: the number of pairs of run and network.
         before: mean |predicted / published - 1| without the run.
-        after: the same with it.
-        held: share of the networks whose rates all lie in the narrowed intervals.
+        after: the same with the run.
+        held: share of the networks whose rates are all inside the narrowed intervals.
     """
 
     pairs: int
@@ -330,9 +329,9 @@ class Corrected:
 
 
 def corrected(owner: str, board: str) -> dict[str, Corrected]:
-    """Take each published case of the owner's board as a run, to correct those of a board.
+    """Correct the cases of a board by each published case of the owner's board, used as a run.
 
-    All of them are predicted without their families.
+    All cases are predicted without their families.
     """
     by_kin = defaultdict(list)
     theirs, ours = (

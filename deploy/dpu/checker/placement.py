@@ -97,7 +97,7 @@ class Cut:
 
 @dataclass(frozen=True)
 class Placement:
-    """Where each operation of a network runs.
+    """The device of each operation of a network.
 
     Attributes:
         nodes: the operations in the order of the file, each with its device.

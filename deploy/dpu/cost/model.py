@@ -213,7 +213,7 @@ class Layers:
 
 SERIAL_PORT = 2
 SERIAL_DDR = 3
-"""How many times as long a serial read takes through the port and from the DDR: 3.6 GB/s on a
+"""Factors of the time of a serial read through the port and from the DDR. They give 3.6 GB/s on a
 ZCU104, where AMD's profile of its layers has 3.2 to 3.7.
 """
 
