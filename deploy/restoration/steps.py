@@ -33,8 +33,8 @@ class Around:
     """The user's choice of the two steps around a network, which a run uses where possible.
 
     Attributes:
-        consistency: True to make the result agree with the raw image at low spatial frequencies
-            (the consistency step).
+        consistency: True to smooth the dark and make the result agree with the raw image at low
+            spatial frequencies (the consistency step).
         exposure: True to restore dark parts of the image, and strong edges, at exposures of their
             own: they are multiplied by a factor before the network and divided by it afterwards.
     """

@@ -87,7 +87,8 @@ def evaluate(
             0.25,0.05.
         bits_per_pixel: also compare restoration before and after JPEG 2000 compresses to this
             number of bits per pixel; several with commas.
-        consistency: networks that are given the sensor agree with the image at low frequencies.
+        consistency: networks that are given the sensor agree with the image at low frequencies, and
+            the dark is smoothed.
         exposure: shipped networks restore dark parts and strong edges at other exposures.
         strict: refuse pairs whose pixels contradict the sensor, instead of a warning.
         detector: ONNX detector as Ultralytics exports it, which is shown the labelled images.

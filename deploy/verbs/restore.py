@@ -104,8 +104,8 @@ def restore(
             half_width).
         view: HTML file to write, which compares raw and restored in a browser.
         strict: refuse what contradicts the sensor or fails the self-check, instead of a warning.
-        consistency: make the result agree with the image at low spatial frequencies, if the sensor
-            is named.
+        consistency: make the result agree with the image at low spatial frequencies, and smooth the
+            dark, if the sensor is named.
         exposure: restore dark parts and strong edges at other exposures (shipped networks).
         fix_detectors: interpolate faulty pixels first: 'found' searches for them and lists them
             next to the output; or a list, lines of column,row with * for a whole column.
