@@ -36,9 +36,11 @@ def boards_of(board: BoardLike | Sequence[BoardLike]) -> list[TargetProfile]:
     if isinstance(board, str):
         every = board.removesuffix(MODEL_SUFFIX) == ALL
         sources = board_names() if every else [name.strip() for name in board.split(",")]
+    elif isinstance(board, Sequence):
+        sources = board
     else:
         # What is no board is refused when it is loaded.
-        sources = board if isinstance(board, list | tuple) else [board]
+        sources = [board]
     return list(map(TargetProfile.load, sources))
 
 

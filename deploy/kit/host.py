@@ -9,8 +9,8 @@ factors. The script needs NumPy, host.json and onnxruntime; a board needs other 
 1. Each tile goes to core.onnx. Where host.json has exposures, core-x4.onnx restores dark pixels,
    multiplied by 4, and so on (`factors`, `exposed`).
 2. Around a core, the host encodes the tile as int8 planes, and adds the result to it (`restored`).
-3. After the last tile, the consistency step (`consistent`) smooths the dark and corrects low spatial
-   frequencies.
+3. After the last tile, the consistency step (`consistent`) smooths the dark and corrects low
+   spatial frequencies.
 4. Then the self-check (`judged`) writes two figures of each block into restored-check.npy.
 5. Each core restores a drawn tile (`known_tile`), to be compared with known.json (`--learn`).
 """
@@ -177,7 +177,7 @@ def smoothed(x: np.ndarray) -> np.ndarray:
     light = np.maximum(mean - DARK, F(0))
     n = np.maximum(dark + growth * light + square * light**2, F(0))
     variance = summed(wide * wide, window, window, 1) - mean * mean
-    rest = n / np.maximum(np.maximum(variance, n), np.finfo(F).tiny)
+    rest = n / np.maximum(np.maximum(variance, n), F(1e-30))
     share, mean = (summed(values, window, window, 1) for values in (rest, rest * mean))
     return np.asarray(x - share * x + mean)
 

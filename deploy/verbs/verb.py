@@ -123,7 +123,7 @@ def _require_text(name: str, value: object, parts: list[Any]) -> None:
 def _number(name: str, value: object) -> float:
     """Return a number of Python or NumPy as a float, or raise OptionError."""
     # float() would read text, and would count True as 1.
-    given = value if isinstance(value, Real) and not isinstance(value, bool) else None
+    given = None if isinstance(value, bool) or not isinstance(value, Real) else value
     try:
         return float(cast(float, given))
     except (TypeError, OverflowError) as error:

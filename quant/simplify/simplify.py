@@ -155,8 +155,8 @@ def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 def _run_passes(model: onnx.ModelProto) -> None:
     """Rewrite the nodes of a network in place, without renaming its inputs and outputs."""
     graph = OnnxGraph(model)
-    for rewriting in (clip_last, choose_by_relu, partial(drop_where, float_shapes(graph))):
-        graph.rewrite(rewriting)
+    for replacement in (clip_last, choose_by_relu, partial(drop_where, float_shapes(graph))):
+        graph.rewrite(replacement)
     # What was replaced would count as a reader.
     graph.save()
     for rewriting in (
