@@ -11,7 +11,7 @@ from tests.model.simulator.stages import NOMINAL, plain_sensor
 
 SENSORS = {"nominal": NOMINAL, "offset": plain_sensor(offset=Offset(64.0))}
 DARK_DN = 20.0
-LEFT = 0.2
+LEFT = 0.15
 """The deviation of the noise that a network leaves, as a share of the raw image's."""
 
 
