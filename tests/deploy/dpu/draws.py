@@ -1,6 +1,4 @@
-"""What stands between two convolutions of a small network, drawn by one call, and the rules that
-the whole breaks.
-"""
+"""Functions that add nodes between two convolutions, and list the rules that the network breaks."""
 
 from collections.abc import Callable, Iterable
 from itertools import chain
@@ -30,7 +28,7 @@ def rules_of(nodes: Iterable[PlacedNode]) -> list[str]:
 
 
 def between_convs(tmp_path: Path, draw: Draw, dpu: Dpu = DPU, channels: int = 8) -> list[str]:
-    """Rules broken by what `draw` puts between two convolutions."""
+    """Return the rules that a network with `draw` between two convolutions breaks."""
     sketch = Sketch(channels)
     middle = draw(sketch, sketch.conv("image", (channels, channels, 1, 1)))
     result = sketch.node("AveragePool", middle, kernel_shape=[1, 1])
@@ -72,7 +70,7 @@ def padded(mode: str) -> Draw:
 
 
 def in_two(first: Draw, second: Draw) -> Draw:
-    """Two draws, one behind the other."""
+    """Return a draw that applies `first` and then `second`."""
     return lambda sketch, source: second(sketch, first(sketch, source))
 
 

@@ -1,4 +1,4 @@
-"""Small ONNX files made node by node, for the tests of the checker and the cost model."""
+"""Small ONNX files built node by node, for the tests of the checker and the cost model."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -53,7 +53,7 @@ class Sketch:
 
 
 def float_convbeers(path: Path, blocks: int, features: int) -> Path:
-    """The float encoding: head, residual blocks, body end, tail, global add."""
+    """Write ConvBEERS in float: head, residual blocks, body end, tail, global add."""
     sketch = Sketch(channels=1)
     wide = (features, features, 3, 3)
     stream = head = sketch.conv("image", (features, 1, 3, 3))
@@ -100,7 +100,7 @@ class IntegerSketch(Sketch):
 def integer_convbeers(
     path: Path, blocks: int, features: int, weight_scale: float = 2.0**-7
 ) -> Path:
-    """The host's integer encoding, one int8 plane in, the correction added to the image behind."""
+    """Write ConvBEERS in the host's integer encoding, which adds a correction to the image."""
     s = IntegerSketch()
     wide = (features, features, 3, 3)
     stream = head = s.qconv(s.quantized("image"), (features, 1, 3, 3), weight_scale)
@@ -115,9 +115,7 @@ def integer_convbeers(
 
 
 def board_convbeers(path: Path, blocks: int, features: int) -> Path:
-    """The board's QDQ encoding of the core by itself, int8 weights and bias through
-    DequantizeLinear.
-    """
+    """Write the core alone in the board's QDQ encoding, with weights and biases of int8."""
     s = QdqSketch(1)
 
     def conv(source: str, *weight: int) -> str:
@@ -134,7 +132,7 @@ def board_convbeers(path: Path, blocks: int, features: int) -> Path:
 
 
 class QdqSketch(Sketch):
-    """A sketch in QDQ encoding, every tensor with a scale of its own: 2^-n is its scale."""
+    """A sketch in QDQ encoding, where each tensor has its own scale: 2^-frac_bits."""
 
     def scale(
         self, frac_bits: float | list[float], zero: int = 0, kind: type = np.int8
@@ -151,8 +149,9 @@ class QdqSketch(Sketch):
         zero: int = 0,
         read: tuple[float, int] | None = None,
     ) -> str:
-        """A tensor quantised and dequantised; `read` is the scale and the zero point of who reads
-        another.
+        """Quantise and dequantise a tensor.
+
+        `read` holds the fractional bits and the zero point of a reader that differs.
         """
         numbers = self.scale(frac_bits, zero)
         read_numbers = numbers if read is None else self.scale(*read)
@@ -161,7 +160,7 @@ class QdqSketch(Sketch):
         )
 
     def stored(self, value: np.ndarray, frac_bits: float | list[float] = 7) -> str:
-        """A constant seen as float; one of float32 as it is."""
+        """Return a constant as float: integers are dequantised, float32 stays as it is."""
         name = self.constant(value)
         if value.dtype == np.float32:
             return name

@@ -1,6 +1,4 @@
-"""Each board by its own file: what one refuses and another takes, what a remedy repairs, whose
-manual is named.
-"""
+"""Tests of each board's own rules: what it refuses, what a remedy repairs, which DPU it names."""
 
 import re
 from collections.abc import Callable
@@ -52,8 +50,8 @@ def prelu(s: Sketch, x: str) -> str:
     return s.node("PRelu", x, s.weight(8, 1, 1))
 
 
-# What only these boards refuse, with the rule, the network, the same with the remedy followed, and
-# its channels.
+# Each case: the only boards that refuse it, the rule, the network, the network with the remedy
+# followed, and its channels.
 CASES: list[tuple[tuple[str, ...], str, Draw, Draw, int]] = [
     (
         ZYNQ,
@@ -97,40 +95,40 @@ def test_a_rule_refuses_its_case_on_its_boards_alone_and_the_remedy_passes_on_ev
 ) -> None:
     for name, dpu in DPUS.items():
         rules = between_convs(tmp_path, draw, dpu, channels)
-        # The conv area of the VEK280 is tighter: it refuses a wide window for that.
+        # The VEK280 refuses a wide window by its conv area, which is tighter.
         if (name, rule) != ("vek280", "conv window"):
             assert rules == ([rule] if name in boards else [])
         assert between_convs(tmp_path, remedied, dpu, channels) == []
 
 
-def compared(channels: int) -> Draw:
+def argmax_of(channels: int) -> Draw:
     return lambda s, x: s.node("ArgMax", s.conv(x, (channels, 8, 1, 1)), axis=1)
 
 
 @pytest.mark.parametrize(
     ("draw", "boards"),
     [
-        # Behind a convolution that changes nothing.
+        # The simplifier inserts a convolution that changes nothing in front of the ReLU.
         (behind_mean("Relu"), set(DPUS)),
-        # In front of a maximum it gives the same.
+        # The simplifier moves the ReLU in front of the max pool: the result is the same.
         (behind_pool("Relu"), set(DPUS)),
         (behind_sum("HardSwish"), set(DPUS)),
         (behind_depthwise("HardSwish"), set(DPUS)),
         (behind_conv("HardSigmoid"), set(DPUS)),
         (behind_sum("HardSigmoid"), set(DPUS)),
-        (compared(128), {*ZYNQ, "vek280"}),
-        (compared(129), {"vek280"}),
+        (argmax_of(128), {*ZYNQ, "vek280"}),
+        (argmax_of(129), {"vek280"}),
         (conv(4097, 8, 1, 1), {"vek280"}),
         # With padding it is split into parts of three rows.
         (conv(8, 8, 16, 16, pads=[7] * 4), set(DPUS)),
         (conv(8, 8, 16, 16, pads=UNPADDED), set(ZYNQ)),
     ],
 )
-def test_which_boards_take_what(draw: Draw, boards: set[str], tmp_path: Path) -> None:
+def test_which_boards_accept_an_operator(draw: Draw, boards: set[str], tmp_path: Path) -> None:
     assert {name for name, dpu in DPUS.items() if not between_convs(tmp_path, draw, dpu)} == boards
 
 
-def test_a_smaller_dpu_takes_fewer_channels(tmp_path: Path) -> None:
+def test_a_smaller_dpu_accepts_fewer_channels(tmp_path: Path) -> None:
     sketch = Sketch(8)
     path = sketch.save(tmp_path / "c.onnx", sketch.conv("image", (2049, 8, 1, 1)))
     assert broken_rules(path, load_dpu("zcu102", "B512")) == ["conv channels"]
@@ -140,7 +138,7 @@ def test_a_smaller_dpu_takes_fewer_channels(tmp_path: Path) -> None:
 
 @given(st.integers(1, 16), st.integers(1, 16), st.integers(1, 8192))
 def test_weights_fit_by_each_manuals_formula(height: int, width: int, channels: int) -> None:
-    """UG1414 3.5, conv2d; for the VCK190 by dpu_op_filter.py."""
+    """The formulas are those of UG1414 3.5, conv2d, and of dpu_op_filter.py for the VCK190."""
     kernel = height, width
     op = Operation("c", "Conv", "conv", ("in",), ("out",), kernel=kernel, channels=(channels, 8))
     area = height * width
@@ -173,9 +171,7 @@ def test_a_rule_whose_constants_no_file_states_would_be_dead() -> None:
 @pytest.mark.parametrize("size", TargetProfile.load("zcu102").configurations)
 @pytest.mark.parametrize("name", ZYNQ)
 def test_a_smaller_dpu_has_a_smaller_array_and_smaller_banks(name: str, size: str) -> None:
-    """PG338: the name is the operations of a cycle; banks of the width of the
-    channels, 2048 deep.
-    """
+    """PG338: the name states the operations per cycle. Banks are 2048 deep and `lanes` wide."""
     dpu = load_dpu(name, size)
     clock_hz = TargetProfile.load(name).value("array", "pl_clock_hz")
     lanes = dpu.input_parallel

@@ -1,5 +1,5 @@
-"""The constants of integer kernels: whose int32 bias the DPU can hold, and who reads a tensor as it
-was written.
+"""Tests of the constants of integer kernels: which int32 bias the DPU can hold, and that a tensor
+is read in the format in which it was written.
 """
 
 from functools import cache
@@ -33,16 +33,14 @@ HALF = Scale((0.5,), (0,), "int8")
 
 
 def rules(model: onnx.ModelProto) -> set[str]:
-    """Broken by the nodes themselves: what a file says of its integers is taken out, as of another
-    tool.
-    """
+    """Return the rules that the nodes break, without the metadata that only our files have."""
     del model.metadata_props[:]
     return set(rules_of(place(network_of(model, 64), DPU).nodes))
 
 
 @cache
 def quantized(spread: float) -> Quantized:
-    """A small network of random weights, its biases so large."""
+    """Quantise a small network of random weights and of biases of standard deviation `spread`."""
     network = plain(Variant(blocks=1, features=4), seed=7)
     generator = torch.Generator().manual_seed(7)
     with torch.no_grad():
@@ -53,7 +51,7 @@ def quantized(spread: float) -> Quantized:
 
 
 def own_file() -> onnx.ModelProto:
-    """The host's, to be spoilt."""
+    """Return a copy of the host's file, which a test may corrupt."""
     return copied(quantized(0.1).host)
 
 
@@ -85,7 +83,7 @@ def test_a_bias_passes_where_some_shift_makes_it_int8(values: list[int], shift: 
         ([64 << 17, 0, 0, 0], {"int32 bias"}),
     ],
 )
-def test_the_bias_of_an_integer_kernel_is_looked_at(
+def test_the_bias_of_an_integer_kernel_is_checked(
     tmp_path: Path, bias: list[int], expected: set[str]
 ) -> None:
     s = IntegerSketch()
@@ -97,8 +95,8 @@ def test_the_bias_of_an_integer_kernel_is_looked_at(
 
 
 @pytest.mark.parametrize("spread", [0.1, 3.0])
-def test_what_quantize_writes_of_random_networks_keeps_every_rule(spread: float) -> None:
-    """In both encodings, biases small and large beside the products."""
+def test_quantized_random_networks_keep_every_rule(spread: float) -> None:
+    """The rules hold in both encodings, with biases small and large compared with the products."""
     network = quantized(spread)
     assert rules(network.host) == rules(board_model(network.core, {})) == set()
 
@@ -113,16 +111,16 @@ def test_what_quantize_writes_of_random_networks_keeps_every_rule(spread: float)
         ("DequantizeLinear", 1),
     ],
 )
-def test_who_reads_a_tensor_otherwise_than_it_was_written_is_refused(
+def test_reading_a_tensor_in_another_format_than_it_was_written_is_refused(
     op_type: str, place: int
 ) -> None:
-    """The last node of a kind, with 4 times the scale at a place, or a zero point one less."""
+    """The last node of a kind reads with 4 times the scale, or with a zero point one less."""
     model = own_file()
     node = [n for n in model.graph.node if n.op_type == op_type][-1]
     value = numpy_helper.to_array(
         next(t for t in model.graph.initializer if t.name == node.input[place])
     )
     altered = value * 4 if value.dtype == np.float32 else value - 1
-    model.graph.initializer.append(numpy_helper.from_array(altered.astype(value.dtype), "spoilt"))
-    node.input[place] = "spoilt"
+    model.graph.initializer.append(numpy_helper.from_array(altered.astype(value.dtype), "altered"))
+    node.input[place] = "altered"
     assert "one format" in rules(model)

@@ -20,9 +20,10 @@ PAPER_FPS = 7.2
 
 
 def test_the_papers_network(tmp_path: Path) -> None:
-    """35 convolutions and 17 adds; every map of 26.2 MB goes out and in, and each add loads one.
+    """The network has 35 convolutions and 17 adds. Every map of 26.2 MB is stored and loaded again,
+    and each add loads one.
 
-    The interval contains the rate that the paper measured, of which no constant is made.
+    The interval contains the rate that the paper measured, although no constant was fitted to it.
     """
     prediction = predict_network(float_convbeers(tmp_path / "f.onnx", 16, 64), DPU)
     assert prediction.operations == pytest.approx(997.5e9, rel=1e-3)
@@ -46,8 +47,8 @@ def test_the_three_encodings_cost_the_same(tmp_path: Path) -> None:
 def test_maps_that_fit_the_banks_do_not_stream(tmp_path: Path) -> None:
     """64 channels of 128 x 128 are exactly 1 MiB; one pixel more streams.
 
-    Even so three operations read the head's result: it is written once and read by a convolution
-    and two adds.
+    Three operations read the head's result, so it is always stored once and loaded three times, by
+    a convolution and two adds.
     """
     path = float_convbeers(tmp_path / "f.onnx", 1, 64)
     assert predict_network(path, DPU, 128).streamed_bytes == 2 * 128 * 128 + 4 * 64 * 128 * 128
@@ -61,7 +62,7 @@ def test_maps_that_fit_the_banks_do_not_stream(tmp_path: Path) -> None:
 def test_rows_columns_and_channels_that_do_not_fill_the_array_take_time_all_the_same(
     tmp_path: Path, board: str, rows: int, columns: int, parallel: int
 ) -> None:
-    """One channel by three columns fill the input of the first layer, not three of them."""
+    """The three columns of the first layer's one channel enter the array together, not in turn."""
     path = float_convbeers(tmp_path / "f.onnx", 1, 40)
     head, wide = (layer.work for layer in predict_network(path, load_dpu(board), 97).layers[:2])
     pixels = (math.ceil(97 / rows) * rows) * (math.ceil(97 / columns) * columns)
@@ -72,17 +73,17 @@ def test_rows_columns_and_channels_that_do_not_fill_the_array_take_time_all_the_
 
 
 def works_of(sketch: Sketch, result: str, path: Path, side_px: int) -> tuple[Work, ...]:
-    """The work of a network that ends in `result`."""
+    """Return the work of each layer of a network that ends in `result`."""
     return count_work(place(read_network(sketch.save(path, result), side_px), DPU).core, DPU)
 
 
 def moved(works: tuple[Work, ...]) -> int:
-    """Map bytes that an image moves."""
+    """Return the map bytes that an image moves."""
     return sum(work.map_bytes for work in works)
 
 
-def test_what_three_branches_read_passes_through_memory(tmp_path: Path) -> None:
-    """A module of three branches: its input read thrice; of two branches: not."""
+def test_the_input_of_three_branches_passes_through_memory(tmp_path: Path) -> None:
+    """Three branches load their stored input three times. The input of two stays on the chip."""
     maps = {}
     burst = BURST_BYTES / 16
     for branches in (2, 3):
@@ -97,7 +98,7 @@ def test_what_three_branches_read_passes_through_memory(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("channels", [(16, 48), (64, 100), (200, 3)])
-def test_what_a_concat_joins_is_stored_in_bursts_and_read_back(
+def test_the_inputs_of_a_concat_are_stored_in_bursts_and_loaded_again(
     tmp_path: Path, channels: tuple[int, int]
 ) -> None:
     s = Sketch(8)
@@ -115,7 +116,7 @@ def test_what_a_concat_joins_is_stored_in_bursts_and_read_back(
 def test_an_add_of_maps_beyond_the_chip_loads_one_of_them(
     tmp_path: Path, side: int, maps: int, convs: int
 ) -> None:
-    """The other is on its way out of the operation before; of maps that fit nothing is moved."""
+    """The other map comes from the operation before. Maps that fit on the chip are not moved."""
     sums = []
     wide = (32, 32, 3, 3)
     for added in (False, True):
@@ -129,8 +130,8 @@ def test_an_add_of_maps_beyond_the_chip_loads_one_of_them(
 
 
 @pytest.mark.parametrize("board", ["vck190", "zcu104"])
-def test_what_an_add_loads_is_hidden_behind_nothing(tmp_path: Path, board: str) -> None:
-    """It takes two to three times as long as a convolution's maps of that size."""
+def test_the_load_of_an_add_is_not_hidden(tmp_path: Path, board: str) -> None:
+    """The load takes two to three times as long as a convolution's maps of the same size."""
     path = float_convbeers(tmp_path / "f.onnx", 1, 64)
     layers = predict_network(path, load_dpu(board), 640).layers
     add = next(layer for layer in layers if layer.work.serial)
@@ -142,9 +143,7 @@ def test_what_an_add_loads_is_hidden_behind_nothing(tmp_path: Path, board: str) 
 
 @pytest.mark.parametrize("block", [2, 4])
 def test_a_pixel_shuffle_costs_the_bursts_of_its_pieces(tmp_path: Path, block: int) -> None:
-    """Three channels of a pixel in a burst of their own; at the network's end it is left to the
-    host.
-    """
+    """The three channels of each pixel take a burst. The host shuffles at the network's end."""
     map_bytes = {}
     for place_in, ends in (("end", True), ("middle", False)):
         s = Sketch(3)
@@ -160,7 +159,10 @@ def test_a_pixel_shuffle_costs_the_bursts_of_its_pieces(tmp_path: Path, block: i
 def test_a_transposed_convolution_runs_as_one_convolution_for_each_phase(
     tmp_path: Path, kernel: int, stride: int, taps: int
 ) -> None:
-    """Each has every s-th tap, filled up, and gives as many pixels as the image has: no zeros."""
+    """Each phase has every s-th tap, padded, and as many output pixels as the image has.
+
+    So the DPU computes no inserted zeros.
+    """
     grown = Sketch(32)
     plain = Sketch(32)
     window = {"strides": [stride] * 2, "pads": [0, 0, kernel - stride, kernel - stride]}
@@ -175,8 +177,8 @@ def test_a_transposed_convolution_runs_as_one_convolution_for_each_phase(
 
 
 def test_the_width_is_the_mean_of_the_widths_of_the_parts(tmp_path: Path) -> None:
-    """What the rate follows decides: the array of wide layers, transfers of large maps, the host of
-    a network with a softmax.
+    """Each part counts by how much the rate follows it: the DPU's parts for large maps, the host
+    for a network with a softmax.
     """
     widths = [DPU.value("cost", WIDTHS[part]) for part in PARTS]
     path = float_convbeers(tmp_path / "f.onnx", 3, 32)
@@ -202,8 +204,8 @@ def test_beyond_the_fitted_networks_the_interval_is_no_narrower_than_the_widest(
 
 
 @pytest.mark.parametrize("contention_exponent", [2.0, 4.0])
-def test_shares_are_by_how_much_the_rate_follows_the_parts(contention_exponent: float) -> None:
-    """Each part 1 % longer, and the rate falls by its share of 1 %."""
+def test_a_share_is_how_much_the_rate_follows_the_part(contention_exponent: float) -> None:
+    """If a part takes 0.01 % longer, the rate falls by its share of 0.01 %."""
     parts = np.array([3.0, 0.5, 2, 0.1, 1.5, 2])
     shares = shares_of(parts[None, :4], parts[None, 4:], contention_exponent)[0]
     assert shares.sum() == pytest.approx(1)
@@ -228,7 +230,7 @@ def test_a_network_without_convolutions_has_no_prediction(tmp_path: Path) -> Non
 def test_of_the_maps_of_yolo_a_sort_reads_one_score_for_each_box(
     tmp_path: Path, channels: tuple[int, ...], read: int
 ) -> None:
-    """Three boxes a pixel; of other maps, such as the classes of SSD, it reads all."""
+    """YOLO has three boxes a pixel. Of other maps, such as the classes of SSD, a sort reads all."""
     sketch = Sketch(8)
     maps = [sketch.conv("image", (count, 8, 3, 3)) for count in channels]
     path = sketch.save(tmp_path / "h.onnx", *maps)
@@ -237,9 +239,7 @@ def test_of_the_maps_of_yolo_a_sort_reads_one_score_for_each_box(
 
 
 def test_latency_is_that_of_one_core_and_one_thread(tmp_path: Path) -> None:
-    """Cores share the memory and the host: alone a core and a thread are no slower than among
-    others.
-    """
+    """Cores share the memory and the host, so one core and one thread are no slower alone."""
     path = float_convbeers(tmp_path / "n.onnx", 2, 16)
     zcu102 = load_dpu("zcu102")
     prediction = predict_network(path, zcu102)

@@ -25,7 +25,7 @@ PLACES = ["front", "behind a convolution", "between", "behind a host's node", "e
 
 
 def network(path: Path, place: str, domain: str) -> Path:
-    """A network of operators that a DPU takes and host parts, one of which is another's."""
+    """Write a network of DPU operators and host parts, with `domain` for the one at `place`."""
     sketch = Sketch(8)
 
     def node(position: str, op_type: str, *inputs: str) -> str:

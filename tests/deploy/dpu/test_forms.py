@@ -12,7 +12,7 @@ DPU = load_dpu("vck190")
 
 
 def placed(path: Path, weight: tuple[int, ...], tile_px: int, *pads: int) -> PlacedNode:
-    """A convolution over a map of that side."""
+    """Place a convolution over a map of `tile_px` pixels a side."""
     sketch = Sketch(weight[1])
     sketch.save(path, sketch.conv("image", weight, pads=[*pads] or [0] * 4))
     return place(read_network(path, tile_px), DPU).nodes[-1]

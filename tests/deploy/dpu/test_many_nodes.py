@@ -1,6 +1,4 @@
-"""Reading and checking takes a number of steps that is linear in the number of nodes, whatever way
-it goes.
-"""
+"""Test that reading and checking takes steps linear in the number of nodes of each kind."""
 
 import sys
 from collections.abc import Callable
@@ -17,19 +15,19 @@ from tests.deploy.dpu.graphs import IntegerSketch
 TraceFunction = Callable[[FrameType, str, Any], Any]
 
 FEWEST = 60
-"""Nodes: the number is doubled twice."""
+"""Number of nodes of the smallest network. It is doubled twice."""
 QUADRATIC = 2.5
-"""A linear step takes twice as many more for the second doubling as for the first, a quadratic one
-four times.
+"""A linear step adds twice as many instructions in the second doubling as in the first, a quadratic
+one four times as many.
 """
 CHANNELS = 8
 WEIGHT = np.random.default_rng(0).normal(0, 0.05, (CHANNELS, CHANNELS, 3, 3)).astype(np.float32)
 SHUFFLED = ((0, 2, 2, 2, 64, 64), (0, 2, 128, 128))
-"""Two shapes by which exporters spell a pixel shuffle."""
+"""The two shapes with which exporters write a pixel shuffle."""
 
 
 def convolved(s: IntegerSketch, x: str) -> str:
-    """Convolve with weights of their own."""
+    """Convolve with weights that are stored for this node alone."""
     return s.node("Conv", x, s.constant(WEIGHT), pads=[1] * 4)
 
 
@@ -39,19 +37,19 @@ def residual(s: IntegerSketch, x: str) -> str:
 
 
 def scaled(s: IntegerSketch, x: str) -> str:
-    """Scale each channel in front of a convolution, which takes the scale in."""
+    """Scale each channel in front of a convolution, which absorbs the scale."""
     factor = s.constant(np.full((1, CHANNELS, 1, 1), 0.9, np.float32))
     return convolved(s, s.node("Mul", s.node("Relu", x), factor))
 
 
 def pointwise(s: IntegerSketch, x: str) -> str:
-    """Change values by themselves, one node after the other."""
+    """Add three element-wise nodes, one after the other."""
     factor = s.constant(np.array(0.99, np.float32))
     return s.node("Sigmoid", s.node("Mul", s.node("Relu", x), factor))
 
 
 def shuffled(s: IntegerSketch, x: str) -> str:
-    """Spell a pixel shuffle as exporters do, and take it back."""
+    """Write a pixel shuffle as exporters do, and reverse it."""
     apart, whole = (s.constant(np.array(shape)) for shape in SHUFFLED)
     moved = s.node("Transpose", s.node("Reshape", x, apart), perm=[0, 1, 4, 2, 5, 3])
     back = s.node("SpaceToDepth", s.node("Reshape", moved, whole), blocksize=2)
@@ -68,7 +66,7 @@ KINDS = (residual, scaled, pointwise, shuffled, integers)
 
 
 def network(kind: Callable[[IntegerSketch, str], str], nodes: int, path: Path) -> Path:
-    """Write a chain of blocks of a kind, with at least so many nodes."""
+    """Write a chain of blocks of a kind, with at least `nodes` nodes."""
     sketch = IntegerSketch(CHANNELS)
     last = "image"
     while len(sketch.nodes) < nodes:
@@ -77,7 +75,7 @@ def network(kind: Callable[[IntegerSketch, str], str], nodes: int, path: Path) -
 
 
 def steps(path: Path) -> int:
-    """Count the instructions of Python that this package carries out; time would depend on the
+    """Count the Python instructions that this package executes. Time would depend on the
     machine.
     """
     count = 0
@@ -107,7 +105,7 @@ def steps(path: Path) -> int:
 def test_steps_grow_with_the_nodes(
     kind: Callable[[IntegerSketch, str], str], tmp_path: Path
 ) -> None:
-    # The first call also counts what is read once a process.
+    # The first call also counts what a process reads only once.
     check(network(kind, FEWEST, tmp_path / "a.onnx"))
     few, more, most = (
         steps(network(kind, FEWEST * times, tmp_path / "a.onnx")) for times in (1, 2, 4)

@@ -1,5 +1,5 @@
-"""A board with an NPU: AMD's table and the file's format decide, remarks name what is unknown, and
-nothing is predicted.
+"""Tests of a board with an NPU: AMD's table and the file's format decide, remarks name what is
+unknown, and nothing is predicted.
 """
 
 import json
@@ -29,7 +29,7 @@ def conv() -> Draw:
 
 
 def activated(op_type: str, zero: int = 0, kind: type = np.int8) -> Draw:
-    """An activation, its result around a zero point, and a convolution that reads it."""
+    """Draw an activation whose result has a zero point, and a convolution that reads it."""
 
     def draw(s: QdqSketch, x: str) -> str:
         slopes = [s.stored(np.ones((4, 1, 1), np.int8))] if op_type == "PRelu" else []
@@ -40,7 +40,7 @@ def activated(op_type: str, zero: int = 0, kind: type = np.int8) -> Draw:
 
 
 def biased(size: int) -> Draw:
-    """A bias that is shifted by 8 bits."""
+    """Draw a convolution whose bias is shifted by 8 bits."""
 
     def draw(s: QdqSketch, x: str) -> str:
         weight = s.stored(np.ones((4, 4, 3, 3), np.int8))
@@ -50,8 +50,8 @@ def biased(size: int) -> Draw:
     return draw
 
 
-def written(path: Path, draw: Draw, opset: int = 17, side: int | None = 31) -> Path:
-    """What `draw` puts behind a convolution, as a file of one image of one size, or of any."""
+def write_network(path: Path, draw: Draw, opset: int = 17, side: int | None = 31) -> Path:
+    """Write a file with `draw` behind a convolution, for images of `side` or of any size."""
     sketch = QdqSketch(4)
     model = onnx.load(sketch.save(path, draw(sketch, sketch.qdq_conv(sketch.pair("image")))))
     model.opset_import[0].version = opset
@@ -67,8 +67,8 @@ def faults(checked: Checked) -> set[str]:
     return failed_checks | set(rules_of(checked.refused))
 
 
-# What DPUs must keep too is in test_number_graphs.py; that it applies here is told in
-# docs/reference/operators.md.
+# The rules that DPUs have too are tested in test_number_graphs.py. docs/reference/operators.md
+# states that they apply here.
 REFUSED: dict[str, tuple[Draw, Draw]] = {
     "int8 alone": (activated("Relu", 128, np.uint8), activated("Relu")),
     "int8 operator": (activated("PRelu"), activated("LeakyRelu")),
@@ -79,26 +79,25 @@ REFUSED: dict[str, tuple[Draw, Draw]] = {
 @pytest.mark.parametrize("rule", REFUSED)
 def test_each_case_is_refused_for_its_rule_and_passes_without_it(rule: str, tmp_path: Path) -> None:
     faulty, remedied = (
-        bd.check(written(tmp_path / "n.onnx", draw), target="vek385") for draw in REFUSED[rule]
+        bd.check(write_network(tmp_path / "n.onnx", draw), target="vek385")
+        for draw in REFUSED[rule]
     )
     assert (faults(faulty), bool(faulty)) == ({rule}, False)
     assert (faults(remedied), bool(remedied)) == (set(), True)
 
 
 def test_an_open_size_and_a_new_opset_are_refused(tmp_path: Path) -> None:
-    left_open = written(tmp_path / "n.onnx", conv(), side=None)
+    left_open = write_network(tmp_path / "n.onnx", conv(), side=None)
     assert faults(bd.check(left_open, target="vek385")) == {"sizes left open"}
-    assert bd.check(written(tmp_path / "n.onnx", conv(), opset=20), target="vek385")
+    assert bd.check(write_network(tmp_path / "n.onnx", conv(), opset=20), target="vek385")
     output = done(
-        "check", written(tmp_path / "n.onnx", conv(), opset=21), "--target", "vek385", code=1
+        "check", write_network(tmp_path / "n.onnx", conv(), opset=21), "--target", "vek385", code=1
     )
     assert " ".join(output.split()).rpartition("check FAILED: ")[2].startswith("opset 21 (Xilinx")
 
 
 def mixed(s: QdqSketch, x: str) -> str:
-    """A depthwise convolution, one left in float, and an operator that the table as read does not
-    have.
-    """
+    """Draw a depthwise convolution, one left in float, and an operator that the table lacks."""
     deep = s.pair(
         s.node("Conv", x, s.stored(np.ones((4, 1, 3, 3), np.int8)), group=4, pads=[1] * 4)
     )
@@ -108,7 +107,7 @@ def mixed(s: QdqSketch, x: str) -> str:
 
 
 def test_what_is_legal_but_worth_knowing_is_a_note(tmp_path: Path) -> None:
-    path = written(tmp_path / "n.onnx", mixed)
+    path = write_network(tmp_path / "n.onnx", mixed)
     output = done(f"check {path} --target vek385 --json {tmp_path}/o.json")
     rows = valid(tmp_path / "o.json")["rows"]
     devices = {row["text"]["device"] for row in rows if row["table"] == "nodes"}
@@ -121,9 +120,7 @@ def test_what_is_legal_but_worth_knowing_is_a_note(tmp_path: Path) -> None:
 
 
 def test_no_limit_of_a_dpu_is_applied(tmp_path: Path) -> None:
-    """Channels that every DPU refuses, and a kernel as large as its map, which would be asked for
-    the array.
-    """
+    """Every DPU refuses so many channels, and its array decides on a kernel as large as the map."""
     s = QdqSketch(4)
     narrow = s.conv(s.conv("image", (9000, 4, 1, 1)), (4, 9000, 1, 1))
     path = s.save(tmp_path / "n.onnx", s.conv(narrow, (4, 4, 31, 31), pads=[0] * 4))

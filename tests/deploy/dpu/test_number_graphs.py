@@ -1,5 +1,5 @@
-"""Each rule of numbers with a small QDQ file that breaks it alone, and the same file with the
-remedy followed.
+"""Tests of each rule of numbers, with a small QDQ file that breaks it alone, and the same file with
+the remedy followed.
 """
 
 import math
@@ -38,7 +38,7 @@ def joined(output: float) -> Draw:
 
 
 def combined(op_type: str, kind: type, frac_bits: float = 7) -> Draw:
-    """The tensor added to or multiplied by a constant for each channel."""
+    """Draw an operator that combines the tensor with a constant for each channel."""
     return lambda s, x: s.pair(s.node(op_type, x, s.stored(np.ones((1, 4, 1, 1), kind), frac_bits)))
 
 
@@ -47,7 +47,7 @@ def read(frac_bits: float, zero: int = 0) -> Draw:
 
 
 def twice(first: float, second: float) -> Draw:
-    """A sum that is quantised once for each of its two readers."""
+    """Draw a sum that is quantised once for each of its two readers."""
 
     def draw(s: QdqSketch, x: str) -> str:
         total = s.node("Add", x, x)
@@ -87,7 +87,7 @@ CASES: dict[str, tuple[Draw, Draw]] = {
 
 
 def remedies(path: Path, draw: Draw) -> dict[str, str]:
-    """Rules broken by what `draw` puts behind a convolution, with their remedies."""
+    """Return the rules that `draw` behind a convolution breaks, with their remedies."""
     sketch = QdqSketch(4)
     end = draw(sketch, sketch.qdq_conv(sketch.pair("image")))
     nodes = place(read_network(sketch.save(path, end), 32), DPU).nodes
@@ -110,9 +110,7 @@ def test_each_rule_refuses_its_file_alone_and_following_the_remedy_passes(
 
 
 def test_two_nodes_may_read_the_same_constant_at_two_scales(tmp_path: Path) -> None:
-    """As an optimiser leaves them that stores equal bytes once: each has its
-    own copy on the board.
-    """
+    """An optimiser that stores equal bytes once writes such files. The board has two copies."""
 
     def draw(s: QdqSketch, x: str) -> str:
         weight = s.constant(np.ones((4, 4, 3, 3), np.int8))

@@ -1,4 +1,4 @@
-"""Runs of an owner's board correct the cost model by kinship."""
+"""Test that runs of an owner's board correct the cost model by kinship."""
 
 import json
 import math
@@ -20,8 +20,8 @@ RUN = '{"model": "deep.onnx", "fps": 3}'
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A network that the DPU bounds, a wider one of the same kinds of layers, and one that the host
-    bounds.
+    """Write a network that the DPU bounds, a smaller one of the same kinds of layers, and one that
+    the host bounds.
     """
     path = tmp_path_factory.mktemp("runs")
     integer_convbeers(path / "deep.onnx", 4, 64)
@@ -32,12 +32,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def rate(folder: Path, name: str, dpu: Dpu = DPU, tile_px: int = 320) -> Prediction:
-    """The prediction of a network of the folder."""
+    """Return the prediction of a network of the folder."""
     return predict_network(folder / f"{name}.onnx", dpu, tile_px)
 
 
 def runs_of(folder: Path, factor: float, *more: dict[str, str], name: str = "deep") -> OwnRuns:
-    """A run of a network, so many times as fast as predicted, for each of the keys to add."""
+    """Return runs of a network that are `factor` times as fast as predicted, one for each
+    `more`.
+    """
     runs = []
     for keys in more or ({},):
         dpu = load_dpu(keys.get("target", "vck190"), keys.get("configuration"))
@@ -49,9 +51,10 @@ def runs_of(folder: Path, factor: float, *more: dict[str, str], name: str = "dee
 
 
 def test_a_run_corrects_by_kinship(folder: Path) -> None:
-    """Nearly wholly the same again, less on another configuration or of another size, less again a
-    network of the same kinds of layers, and one that the host bounds not at all. What is corrected
-    is narrower.
+    """A run corrects the same network most, and less on another configuration or at another size.
+
+    It corrects a network of the same kinds of layers still less, and one that the host bounds not
+    at all. A corrected interval is narrower.
     """
     runs = runs_of(folder, 0.5)
     six = load_dpu("vck190", "C32B6")
@@ -72,7 +75,7 @@ def test_a_run_corrects_by_kinship(folder: Path) -> None:
 
 
 def test_runs_of_another_board_with_the_same_dpu_count(folder: Path) -> None:
-    """What is the board's is left out; a board with another DPU is refused."""
+    """The board's own share does not count. A board with another DPU is refused."""
     runs = runs_of(folder, 0.5, {"target": "zcu104"})
     corrected = rate(folder, "deep", runs.applied(load_dpu("zcu102")))
     assert math.log(corrected.speed) / math.log(0.5) == pytest.approx(sum(SHARES[1:3]))
@@ -82,7 +85,7 @@ def test_runs_of_another_board_with_the_same_dpu_count(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 3, 30])
-def test_runs_repeated_correct_further_and_never_beyond_what_they_say(count: int) -> None:
+def test_repeated_runs_correct_further_but_not_beyond_their_own_rate(count: int) -> None:
     runs = [((1, 2, 3, 4), math.log(0.5))] * count
     scatter = 1 - sum(SHARES)
     factor, left = correction((1, 2, 3, 4), runs)
@@ -92,7 +95,7 @@ def test_runs_repeated_correct_further_and_never_beyond_what_they_say(count: int
     assert correction((0, 0, 0, 0), runs) == (1.0, 1.0)
 
 
-def test_each_run_is_compared_with_what_the_others_say_of_it(folder: Path) -> None:
+def test_each_run_is_compared_with_its_prediction_from_the_others(folder: Path) -> None:
     first, second = runs_of(folder, 0.5, {}, {"configuration": "C32B6"}).run_rows()
     for row in (first, second):
         before, after = (

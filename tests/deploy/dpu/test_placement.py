@@ -45,8 +45,8 @@ def test_the_core_of_each_encoding_is_one_subgraph_between_host_parts(
     assert "subgraphs" not in remarks
 
 
-def test_a_branch_past_the_cpu_does_not_join_what_it_parts(tmp_path: Path) -> None:
-    """The skip ends in the second piece: were the two one, it would wait for itself."""
+def test_a_branch_past_the_cpu_does_not_join_the_two_subgraphs(tmp_path: Path) -> None:
+    """The skip ends in the second subgraph. If both were one, it would wait for itself."""
     sketch = Sketch(8)
     first = sketch.conv("image")
     end = sketch.node("Add", first, sketch.conv(sketch.node("Sigmoid", first)))
@@ -79,7 +79,7 @@ def test_pixels_are_moved_to_channels_and_back_by_the_host_at_the_ends_alone(
     assert remarks_on(placement, DPU, 20)["shuffles"].startswith(placement.nodes[2].op.name)
 
 
-def test_what_a_classifier_ends_in_is_the_hosts(tmp_path: Path) -> None:
+def test_the_host_computes_the_end_of_a_classifier(tmp_path: Path) -> None:
     sketch = Sketch(8)
     pooled = sketch.node("GlobalAveragePool", sketch.conv("image"))
     scores = sketch.node("Gemm", sketch.node("Flatten", pooled), sketch.weight(8, 3))

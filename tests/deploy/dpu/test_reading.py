@@ -59,9 +59,7 @@ def test_inputs_that_are_no_images_are_refused(tmp_path: Path) -> None:
 def test_the_core_of_a_network_at_half_resolution_has_maps_of_half_the_tile(
     on_board: bool, tmp_path: Path
 ) -> None:
-    """In the host's file the core is only described, and the board's begins
-    behind the rearranging.
-    """
+    """The host's file only describes the core. The board's file begins behind SpaceToDepth."""
     network = quantized_half_resolution()
     model = board_model(network.core, {}) if on_board else network.host
     save_onnx(model, tmp_path / "half.onnx")
@@ -88,7 +86,7 @@ def test_a_core_at_half_resolution_that_is_fixed_to_a_tile_is_fixed_to_half_of_i
 
 @pytest.mark.parametrize(("place_px", "border_px"), [(1, 0), (3, 0), (3, 2), (7, 5)])
 def test_the_usual_tile_has_whole_places(place_px: int, border_px: int, tmp_path: Path) -> None:
-    """It has at least 640 pixels, also where 640 are no whole places, and no place too many."""
+    """The tile has at least 640 pixels, and is the smallest such multiple of the place."""
     model = board_model(quantized_half_resolution().core, {})
     numbers = {PLACE_PX: str(place_px), BORDER_PX: str(border_px)}
     set_model_props(model, {**metadata(model), **numbers})

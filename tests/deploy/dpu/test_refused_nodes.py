@@ -1,4 +1,4 @@
-"""What the DPU refuses at a network's ends, and what that costs."""
+"""Tests of the operators that the DPU refuses at a network's ends, and of their cost."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ DPU = load_dpu("vck190")
 
 
 def segmenter(path: Path, where: str, scale: float = 8.0, behind: str = "") -> Path:
-    """Scores of 19 classes at an eighth of the size, enlarged."""
+    """Write a network that enlarges scores of 19 classes from an eighth of the size."""
     sketch = Sketch(3)
     deep = sketch.conv("image", (32, 3, 3, 3), strides=[8, 8])
     scores = sketch.conv(deep, (19, 32, 1, 1))
@@ -35,8 +35,8 @@ def predicted(path: Path) -> Prediction:
     return predict_network(path, DPU, 128)
 
 
-def test_what_the_dpu_enlarges_costs_the_processor_nothing(tmp_path: Path) -> None:
-    """UG1414: eight times with corners in place, not with half pixels."""
+def test_an_enlargement_on_the_dpu_costs_the_processor_nothing(tmp_path: Path) -> None:
+    """UG1414: the DPU enlarges eight times in mode asymmetric, but not in mode half_pixel."""
     on_dpu, on_cpu = (
         predicted(segmenter(tmp_path / f"{w}.onnx", w)) for w in ("asymmetric", "half_pixel")
     )
@@ -47,14 +47,14 @@ def test_what_the_dpu_enlarges_costs_the_processor_nothing(tmp_path: Path) -> No
     assert on_cpu.host_interval_s[1] > on_cpu.refused_s[1]
 
 
-def test_what_follows_the_processor_stays_with_it(tmp_path: Path) -> None:
+def test_nodes_behind_a_refused_node_stay_on_the_processor(tmp_path: Path) -> None:
     path = segmenter(tmp_path / "n.onnx", "half_pixel", behind="GlobalMaxPool")
     placement = place(read_network(path, 128), DPU)
     assert [node.device for node in placement.nodes] == ["DPU", "DPU", "CPU", "host"]
     assert [cut.onto_dpu for cut in placement.cuts] == [True, False]
 
 
-def test_a_refused_node_in_front_is_the_processors_too(tmp_path: Path) -> None:
+def test_a_refused_node_in_front_also_runs_on_the_processor(tmp_path: Path) -> None:
     sketch = Sketch(8)
     path = sketch.save(tmp_path / "n.onnx", sketch.conv(sketch.node("Softmax", "image", axis=1)))
     assert predict_network(path, DPU, 20).refused == (sketch.nodes[0].name,)
@@ -99,7 +99,7 @@ def test_time_is_in_proportion_to_the_work_and_lies_between_peak_and_plain_code(
     assert refused_interval_s([], dpu) == (0.0, 0.0)
 
 
-def test_what_it_runs_is_said_with_its_time(tmp_path: Path) -> None:
+def test_the_notes_name_the_nodes_that_the_processor_runs(tmp_path: Path) -> None:
     prediction = predicted(segmenter(tmp_path / "n.onnx", "half_pixel"))
     _, sentence = host_words(prediction)
     assert "vck190" in sentence
@@ -108,8 +108,9 @@ def test_what_it_runs_is_said_with_its_time(tmp_path: Path) -> None:
 
 
 def heads(path: Path) -> Path:
-    """Two maps of 255 channels, a half and a quarter of the size, the image's pixels first moved to
-    channels.
+    """Write a network of two maps of 255 channels, at a half and a quarter of the size.
+
+    It first moves the image's pixels to channels.
     """
     sketch = Sketch(3)
     apart = sketch.node("SpaceToDepth", "image", blocksize=2)

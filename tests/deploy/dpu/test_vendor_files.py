@@ -1,5 +1,5 @@
-"""Files that other quantisers write: read without a crash, refused for what the DPU cannot compute,
-and no more.
+"""Tests of files from other quantisers: they are read without a crash, and refused only for what
+the DPU cannot compute.
 """
 
 from pathlib import Path
@@ -20,7 +20,7 @@ TILE_PX = 34
 
 
 class RandomSketch(Sketch):
-    """Weights that calibrate to sensible scales."""
+    """A sketch whose weights calibrate to sensible scales."""
 
     def weight(self, *shape: int) -> str:
         return self.constant(
@@ -32,7 +32,7 @@ class RandomSketch(Sketch):
 
 
 def float_file(path: Path) -> Path:
-    """Convolutions with bias, a residual add, pools, and a transposed convolution."""
+    """Write convolutions with bias, a residual add, a pool and a transposed convolution."""
     s = RandomSketch(1)
     head = s.biased("image", 8, 1, 3, 3)
     stream = s.node("Add", head, s.biased(s.node("Relu", s.biased(head, 8, 8, 3, 3)), 8, 8, 3, 3))
@@ -75,7 +75,7 @@ def rules(placement: Placement) -> set[str]:
         (QuantFormat.QOperator, QuantType.QUInt8, True),
     ],
 )
-def test_onnxruntimes_files_are_refused_for_their_numbers_alone(
+def test_onnxruntimes_files_are_refused_only_for_their_scales_and_types(
     tmp_path: Path, form: QuantFormat, kind: QuantType, per_channel: bool
 ) -> None:
     signed = kind == QuantType.QInt8
