@@ -1,4 +1,4 @@
-"""Golden vectors, compared with simulated boards that compute wrongly in known ways."""
+"""Tests of golden vectors, compared with simulated boards that compute wrongly in known ways."""
 
 import json
 import shutil
@@ -64,7 +64,7 @@ def golden(vectors: Path) -> Golden:
 
 
 def middle(core: IntCore) -> IntConv:
-    """A convolution in the middle, which faults are put into."""
+    """Return a convolution in the middle of the core, into which tests put faults."""
     return core.convolutions[len(core.convolutions) // 2]
 
 
@@ -81,7 +81,7 @@ def flipped(values: np.ndarray, place: tuple[int, ...], bit: int) -> np.ndarray:
 
 
 def board(core: IntCore, planes: np.ndarray, half_even: bool = False) -> dict[str, np.ndarray]:
-    """What a board writes of every tensor."""
+    """Return every tensor as a board writes it."""
     tensors = {PLANES: planes.astype(np.int16)}
     for op in core.ops:
         sums, shift, _, _ = layer_sums(core, op, tensors)
@@ -102,7 +102,7 @@ FAULTS: dict[str, tuple[Board, str, str]] = {
     ),
     "planes": (lambda core, planes: board(core, planes ^ 1), PLANES, "everywhere"),
 }
-"""What a board computes, the first layer that differs, and where in it."""
+"""For each fault: the board, the first layer that differs, and where in the layer."""
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_the_place_of_differences_is_named(place: Any, words: str) -> None:
 def results(
     golden: Golden, folder: Path, run: Board, wants: Callable[[str], bool] = lambda _: True
 ) -> Path:
-    """What a board writes of some tensors, in a folder."""
+    """Write the tensors that `wants` chooses into a folder, as a board does."""
     for case, tensors in golden.cases.items():
         (folder / case).mkdir(parents=True)
         outputs = run(golden.core, tensors[PLANES])
@@ -135,7 +135,7 @@ def results(
     return folder
 
 
-def test_a_sound_board_differs_nowhere(vectors: Path, golden: Golden, tmp_path: Path) -> None:
+def test_a_correct_board_differs_nowhere(vectors: Path, golden: Golden, tmp_path: Path) -> None:
     comparison = compare_golden(vectors, results(golden, tmp_path / "r", board))
     assert comparison
     assert all(row.figures["differing"].value == 0 and not row.text["where"] for row in comparison)
@@ -143,7 +143,7 @@ def test_a_sound_board_differs_nowhere(vectors: Path, golden: Golden, tmp_path: 
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_is_seen_at_its_first_layer_and_place(
+def test_a_fault_is_found_at_its_first_layer_and_place(
     fault: str, vectors: Path, golden: Golden, tmp_path: Path
 ) -> None:
     run, place, words = FAULTS[fault]
@@ -159,7 +159,7 @@ def test_a_fault_is_seen_at_its_first_layer_and_place(
     assert all(earlier.figures["differing"].value == 0 for earlier in before)
 
 
-def test_layers_that_nobody_saw_are_counted(vectors: Path, golden: Golden, tmp_path: Path) -> None:
+def test_layers_without_results_are_counted(vectors: Path, golden: Golden, tmp_path: Path) -> None:
     run = FAULTS["ties"][0]
     last = golden.core.ops[-1].output
     folder = results(golden, tmp_path / "r", run, lambda name: name == last)
@@ -168,8 +168,8 @@ def test_layers_that_nobody_saw_are_counted(vectors: Path, golden: Golden, tmp_p
     assert detail.endswith(f", {unseen} layers before it were not handed out")
 
 
-def test_results_are_taken_as_boards_write_them(tmp_path: Path) -> None:
-    """Channels last, uint8 around 128, and floats; other numbers, names and shapes are refused."""
+def test_results_are_accepted_as_boards_write_them(tmp_path: Path) -> None:
+    """Channels last, uint8 around 128 and floats are accepted; other values and shapes are not."""
     vectors = write_golden("convbeers-xs-int8", tmp_path / "golden", tile=TILE_PX)
     folder = tmp_path / "r" / "noise"
     golden = read_golden(vectors)
@@ -214,7 +214,7 @@ def test_the_command_writes_and_compares(tmp_path: Path) -> None:
 
 @pytest.fixture
 def copied(tmp_path: Path) -> Path:
-    """Golden vectors with one case, which a test damages."""
+    """Write golden vectors with one case, which a test damages."""
     write_golden(SHIPPED[0], tmp_path / "golden", tile=TILE_PX)
     index = json.loads((tmp_path / "golden" / INDEX).read_text())
     index["cases"] = {"noise": index["cases"]["noise"]}

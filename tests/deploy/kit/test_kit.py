@@ -1,5 +1,5 @@
-"""The kit for a board's engineer: its host part computes the host file's bytes, and its record
-states what it is.
+"""Tests of the kit for a board's engineer: its host part computes the host file's bytes, and its
+record states what it is.
 """
 
 import json
@@ -55,7 +55,7 @@ runpy.run_path("host.py", run_name="__main__")
 
 
 def behind_fitted_kernels() -> bd.Network:
-    """A small network whose analytic restoration has a coarse copy."""
+    """Return a small network whose analytic restoration has a coarse copy."""
     net = behind_a_bank(Variant(1, 8, 2), 0.1)
     weights = Weights(arrays(net.state_dict()), net.variant, {}, conditioned=True)
     middle = bank_of_vector((0.0,) * 4)
@@ -69,7 +69,7 @@ def behind_fitted_kernels() -> bd.Network:
     ["convbeers-xs-int8", "convbeers-half-xs-int8", "unet", "espcn", "fitted kernels", NORMALISED],
 )
 def test_the_host_part_gives_the_host_files_bytes(name: str, tmp_path: Path) -> None:
-    """On a Python with NumPy and onnxruntime alone, on a swath of odd sides."""
+    """The host part needs only NumPy and onnxruntime, and restores an image of odd sides."""
     int8 = behind_fitted_kernels() if name == "fitted kernels" else network(name)
     folder = bd.Board.load("vck190").kit(int8, tmp_path / "kit", tile=96)
     image = np.random.default_rng(1).random((1, 131, 203), dtype=np.float32)
@@ -111,7 +111,7 @@ def image() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def sensor(tmp_path_factory: pytest.TempPathFactory) -> bd.Sensor:
-    """A sensor whose dark is not 0."""
+    """Return a sensor whose dark offset is not 0."""
     offset = (
         f'[offset]\noffset_dn = {{ value = {OFFSET_DN}, status = "assumed", source = "a test" }}\n'
     )
@@ -154,7 +154,7 @@ def test_the_host_part_refuses_what_it_cannot_restore(
 
 
 def test_digital_numbers_in_the_place_of_shares_are_refused(kit: Path, tmp_path: Path) -> None:
-    """They would all be restored to white."""
+    """Otherwise all of them would be restored to white."""
     np.save(tmp_path / "image.npy", np.full((1, 96, 96), 900, np.uint16))
     command = [sys.executable, "host.py", str(tmp_path / "image.npy"), str(tmp_path / "out.npy")]
     result = subprocess.run(command, cwd=kit, check=False, capture_output=True, text=True)
@@ -171,7 +171,7 @@ def facts(folder: Path) -> dict[str, Any]:
 def test_the_host_part_restores_as_restore_does(
     kit: Path, sensor: bd.Sensor, image: np.ndarray
 ) -> None:
-    """With both steps around the network; each of them changes the image."""
+    """The host part runs both steps around the network, and each of them changes the image."""
     restored = partial(bd.restore, image, network=NAME, sensor=sensor, full_scale=1.0, force=True)
     by_kit = by_host(kit, image)
     np.testing.assert_allclose(by_kit, restored(), rtol=0, atol=1e-6)
@@ -201,7 +201,7 @@ def test_each_exposure_has_a_core_and_a_unit(kit: Path, sensor: bd.Sensor) -> No
 def test_the_host_part_chooses_factors_and_takes_the_consistency_step_as_the_library_does(
     kit: Path, sensor: bd.Sensor, image: np.ndarray
 ) -> None:
-    """Bit for bit, with saturated pixels and without."""
+    """They are equal bit for bit, with saturated pixels and without."""
     host = runpy.run_path(str(kit / "host.py"))
     radius_px = facts(kit)["halo_px"]
     factors = choose_factors(image, sorted(FACTORS), radius_px, 1.0, OFFSET_DN / 4095)
@@ -303,20 +303,20 @@ def test_a_tile_that_no_core_has_is_refused(tile: Any, tmp_path: Path) -> None:
 def test_a_tile_without_room_between_its_halos_is_refused(
     name: str, tile: int, rule: str, tmp_path: Path
 ) -> None:
-    """`host.py` would leave most of the image unwritten."""
+    """Otherwise `host.py` would leave most of the image unwritten."""
     with pytest.raises(OptionError, match=f"`tile` must be {rule}, .* got {tile} px"):
         bd.Board.load("vck190").kit(network(name), tmp_path / "kit", tile=tile)
     assert not (tmp_path / "kit").exists()
 
 
 def test_nothing_of_an_earlier_kit_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its facts and its record would be read as those of the new cores."""
+    """Otherwise its facts and its record would be read as those of the new cores."""
     board = bd.Board.load("vck190")
     folder = board.kit(NAME, tmp_path / "kit", tile=TILE_PX, sensor="pleiades-degraded")
     (folder / "record").mkdir()
     for name in ("known.json", f"record/{RECORD[0]}"):
         (folder / name).write_text("{}", encoding="utf-8")
-    # A network whose host part host.py cannot compute.
+    # host.py cannot compute the host part of this network.
     monkeypatch.setattr("beers_deploy.kit.board.host_facts", lambda *_: None)
     board.kit(network("unet"), folder, tile=TILE_PX)
     names = {path.name for path in folder.rglob("*")}
@@ -342,7 +342,7 @@ def test_a_network_for_another_sensor_is_a_warning(
     assert "made for dior-medium, not for pleiades-degraded" in warning
 
 
-def test_a_record_says_what_a_network_is_and_what_was_checked(tmp_path: Path) -> None:
+def test_a_record_states_what_a_network_is_and_what_was_checked(tmp_path: Path) -> None:
     """The record names licence, training images, hashes and checks, and its bill of materials is
     valid.
 
@@ -361,7 +361,7 @@ def test_a_record_says_what_a_network_is_and_what_was_checked(tmp_path: Path) ->
     assert "All checks passed" in (tmp_path / "gate" / RECORD[1]).read_text(encoding="utf-8")
 
 
-def test_of_a_users_network_nothing_is_made_up(tmp_path: Path) -> None:
+def test_unknown_facts_of_a_users_network_are_recorded_as_unknown(tmp_path: Path) -> None:
     """Facts that are unknown of a user's network are recorded as unknown."""
     folder = bd.Board.load("zcu102").kit(network("unet"), tmp_path / "kit", tile=64, record=True)
     record = json.loads((folder / "record" / RECORD[0]).read_text(encoding="utf-8"))

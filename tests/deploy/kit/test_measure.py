@@ -1,4 +1,4 @@
-"""The script that a board's owner runs, here with onnxruntime's CPU provider."""
+"""Tests of the script that a board's owner runs, here with onnxruntime's CPU provider."""
 
 import json
 import sys
@@ -44,14 +44,14 @@ def test_runs_are_added_to_the_list(
 def test_the_core_of_a_kit_is_measured_at_its_own_size(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """It reads a border around the tile, at half the resolution; the entry has the image's tile."""
+    """The core reads a border, at half the resolution. The entry has the tile of the image."""
     kit = bd.Board.load("vck190").kit("convbeers-half-xs-int8", tmp_path / "kit", tile=64)
     out = kit / "board.json"
     provider = ("--provider", "CPUExecutionProvider", "--frames", 4, "--out", out)
     assert run(monkeypatch, kit / "core.onnx", *provider) == 0
     (entry,) = json.loads(out.read_text())
     assert entry["tile_px"] == 64
-    # As if the board had run it.
+    # The entry now looks as if the board had run it.
     out.write_text(json.dumps([{**entry, "provider": "VitisAIExecutionProvider", "fps": 900.0}]))
     table = bd.bench("convbeers-half-xs-int8", tile=64, measured=out, size="700x600")
     assert any("your runs" in row.figures for row in table.rows)
