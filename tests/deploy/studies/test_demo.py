@@ -19,7 +19,7 @@ from tests.deploy.documents import figures_of, valid
 def test_the_demo_takes_a_raw_image_through_the_whole_chain(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It uses few patches: .ci/run's first stage has all."""
+    """This test uses two patches. The first stage of .ci/run uses all."""
     monkeypatch.setattr("beers_deploy.verbs.demo.GATE_PATCHES", 2)
     raw = tmp_path / "raw.tif"
     tifffile.imwrite(
@@ -62,9 +62,7 @@ def test_a_missing_package_is_named_before_anything_is_written(
 def test_the_reference_has_the_gain_of_the_sensor_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Else every pixel of the scene would be off by the ratio of the gains, and the PSNR would say
-    so.
-    """
+    """Otherwise every pixel would be off by the ratio of the gains, and the PSNR would be wrong."""
     monkeypatch.setattr(demo, "SIDE_PX", 128)
     text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
     (tmp_path / "mine.toml").write_text(text.replace("10.2375", "5.0"))

@@ -1,5 +1,5 @@
-"""`train --recipe`: stages, INT8 file and model card, the same bytes after an interruption, and
-what is refused.
+"""Tests of `train --recipe`: stages, INT8 file and model card, the same bytes after an
+interruption, and refusals.
 """
 
 from pathlib import Path
@@ -76,8 +76,8 @@ def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes
     trained = read_tensors(out / "1-float" / "convbeers-half-xs.safetensors")[1]["recipe"]
     assert isinstance(trained, dict)
     assert trained["held_out"] == ["town_1.png"]
-    # As if it had been stopped between the stages, and within the second one before its first
-    # checkpoint.
+    # The run now looks as if it had been stopped between the stages, and within the second one
+    # before its first checkpoint.
     for name in names:
         (out / name).unlink()
     for path in (out / "2-rounded").iterdir():

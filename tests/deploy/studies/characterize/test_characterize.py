@@ -28,9 +28,7 @@ SENSOR = Instrument(0.09, *noise_from_snr(25, SNRS[0], 100, SNRS[1]), GAIN, 12, 
 
 
 def landscape(seed: int, board: bool) -> np.ndarray:
-    """A drawn scene without its own calibration site; a leaning checkerboard of 100 x 100 pixels in
-    it or none.
-    """
+    """Draw a scene without its own calibration site, and with a slanted checkerboard if `board`."""
     radiance = procedural_scene(SIDE, SIDE, np.random.default_rng(seed)).radiance.copy()
     radiance[:420] = radiance[420:840]
     if board:
@@ -43,7 +41,7 @@ def landscape(seed: int, board: bool) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def raw(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Two raw images of one sensor, the checkerboard in the first."""
+    """Write two raw images of one sensor, the first one with the checkerboard."""
     folder = tmp_path_factory.mktemp("raw")
     paths = folder / "board.tif", folder / "plain.tif"
     for seed, path in enumerate(paths):
@@ -55,7 +53,7 @@ def raw(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 FREQUENCIES = np.array([0.1, 0.25, 0.5])
 KNOWN = Stated(bits=12, mtf=(0.1, 0.1))
-"""No edge is searched for, which takes most of the time."""
+"""With a stated MTF no edge is searched for. The search takes most of the time."""
 
 
 def test_the_profile_is_that_of_the_sensor(raw: tuple[Path, Path], tmp_path: Path) -> None:
@@ -85,7 +83,7 @@ def test_the_profile_is_that_of_the_sensor(raw: tuple[Path, Path], tmp_path: Pat
     assert {figure["mode"] for figure in by_name.values()} == {"measured"}
     intervals = [figure["interval"] for figure in by_name.values()][: len(truths)]
     hits = [low <= truth <= high for (low, high), truth in zip(intervals, truths, strict=True)]
-    # A 95 % interval may miss its truth, so not all eight need to hold it.
+    # A 95 % interval may miss its truth, so not all eight need to contain it.
     assert sum(hits) >= 6
     assert f"95 % interval {intervals[6][0]:.3g} to {intervals[6][1]:.3g}" in out.read_text(
         encoding="utf-8"
@@ -93,12 +91,12 @@ def test_the_profile_is_that_of_the_sensor(raw: tuple[Path, Path], tmp_path: Pat
 
 
 def transfer(frequencies: np.ndarray, mtf_nyquist: float) -> np.ndarray:
-    """The profile's formula, exp(-gamma f) sinc(f)."""
+    """Compute the MTF by the profile's formula, exp(-gamma f) sinc(f)."""
     return np.asarray((mtf_nyquist * math.pi / 2) ** (2 * frequencies) * np.sinc(frequencies))
 
 
 def test_without_a_gain_the_noise_over_full_scale_stands(raw: tuple[Path, Path]) -> None:
-    """To a network only that matters: any gain leaves it."""
+    """Only the noise over full scale matters to a network, and no gain changes it."""
     with_gain = measure(raw, stated=replace(KNOWN, gain=3.0))
     without_gain = measure(raw, stated=KNOWN)
     assert without_gain.gain == pytest.approx(4095 / 400)
@@ -111,7 +109,7 @@ def test_without_a_gain_the_noise_over_full_scale_stands(raw: tuple[Path, Path])
 
 
 def test_a_box_gives_one_axis_for_both(raw: tuple[Path, Path], tmp_path: Path) -> None:
-    # The box holds the upper half of the board's upright edge. The simulator cuts 32 pixels off
+    # The box contains the upper half of the board's upright edge. The simulator cuts 32 pixels off
     # each side of an image.
     middle = SIDE // RATIO // 2 - 32
     box = f"{raw[0]}:{middle - 11},{middle - 38},30,28"
@@ -128,7 +126,7 @@ def test_a_box_gives_one_axis_for_both(raw: tuple[Path, Path], tmp_path: Path) -
     assert result.rows()[0].figures["MTF along at Nyquist"].mode == "unavailable"
 
 
-def test_without_an_edge_the_mtf_is_assumed_and_said_so(tmp_path: Path) -> None:
+def test_without_an_edge_the_mtf_is_assumed_and_marked_so(tmp_path: Path) -> None:
     out = tmp_path / "mine.toml"
     ramp = np.linspace(200, 3000, 320)[:, None] + np.random.default_rng(1).normal(0, 20, (320, 320))
     command = "characterize", tiff(tmp_path, ramp.astype(np.uint16)), "--bits", 12, "--out", out
@@ -145,7 +143,7 @@ def test_without_an_edge_the_mtf_is_assumed_and_said_so(tmp_path: Path) -> None:
 def test_steps_and_a_black_level_change_nothing_but_the_units(
     raw: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    """Ten bits stored in sixteen, above a pedestal: the noise above the dark is the same."""
+    """Values stored eight times as large, above a pedestal, have the same noise above the dark."""
     plain = measure(raw, stated=KNOWN)
     folder = tmp_path / "frames"
     folder.mkdir()
@@ -167,7 +165,7 @@ def test_steps_and_a_black_level_change_nothing_but_the_units(
 
 
 def test_pairs_of_one_scene_give_the_noise_alone(tmp_path: Path) -> None:
-    """Texture as fine as the noise cancels; without the pair it counts as noise."""
+    """In a pair, texture as fine as the noise cancels. In one image it counts as noise."""
     generator = np.random.default_rng(4)
     scene = np.linspace(300, 3000, 320)[:, None] + generator.normal(0, 40, (320, 320))
     for number in range(2):
@@ -312,7 +310,7 @@ def test_names_cannot_break_the_profile(raw: tuple[Path, Path], tmp_path: Path) 
 def test_the_noise_of_a_bound_is_a_profile_that_loads(
     raw: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    """All noise in beta, or in alpha: decimals must not put the SNR beyond what physics allows."""
+    """With all noise in beta, or in alpha, rounding must not make alpha or beta negative."""
     result = measure(raw, stated=KNOWN)
     low, high = result.snrs
     for dark in (math.sqrt(1 / 4), 1 / 4):

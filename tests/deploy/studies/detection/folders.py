@@ -1,4 +1,4 @@
-"""Small labelled folders, laid out as others publish theirs, all of the same two images."""
+"""Write small labelled folders in published layouts, all of the same two images."""
 
 import json
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from beers_deploy.profiles.sensor import Sensor
 from benchmarks.detector.demonstration import synthetic_labelled
 
 Object = tuple[str, float, float, float, float]
-"""A name, then left, top, right and bottom in continuous px."""
+"""Name, left, top, right and bottom, in continuous pixel coordinates."""
 
 SIZE_PX = (40, 60)
 OBJECTS: dict[str, list[Object]] = {
@@ -21,25 +21,25 @@ OBJECTS: dict[str, list[Object]] = {
     "00002": [("ship", 0, 0, 10, 20)],
 }
 SPELT = ("Motor-Car", "SHIP", "aircraft", "Storage tank")
-"""Of the drawn classes, as a folder spells them."""
+"""Names of the drawn classes as a labelled folder spells them."""
 
 
 def image(path: Path, size_px: tuple[int, int] = SIZE_PX) -> Path:
-    """An image file of any kind."""
+    """Write an image file in the format of its suffix."""
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.full((*size_px, 3), 90, np.uint8)).save(path)
     return path
 
 
 def text(path: Path, content: str) -> Path:
-    """A text file, in folders that need not be there."""
+    """Write a text file, and the folders above it where they are missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(content, encoding="utf-8")
     return path
 
 
 def xml(objects: Sequence[Object], size_px: tuple[int, int] = SIZE_PX) -> str:
-    """Pascal VOC: corners count pixels from 1."""
+    """Return labels in Pascal VOC, whose corners count pixels from 1."""
     entries = "".join(
         f"<object><name>{name}</name><difficult>0</difficult>"
         f"<bndbox><xmin>{x1 + 1:g}</xmin><ymin>{y1 + 1:g}</ymin>"
@@ -52,7 +52,7 @@ def xml(objects: Sequence[Object], size_px: tuple[int, int] = SIZE_PX) -> str:
 
 
 def voc(folder: Path) -> Path:
-    """Images and their XML beside them."""
+    """Write images with their XML next to them."""
     for stem, objects in OBJECTS.items():
         image(folder / f"{stem}.png")
         text(folder / f"{stem}.xml", xml(objects))
@@ -60,7 +60,12 @@ def voc(folder: Path) -> Path:
 
 
 def dior(folder: Path, objects: dict[str, dict[str, list[Object]]]) -> Path:
-    """DIOR as published, oriented boxes beside the upright ones; images by split, then by name."""
+    """Write DIOR as published, with oriented and upright boxes.
+
+    Args:
+        folder: where to write.
+        objects: the objects of each image, by split and then by the name of the image.
+    """
     for split, images in objects.items():
         inner = "JPEGImages-test" if split == "test" else "JPEGImages-trainval"
         for stem, boxes in images.items():
@@ -73,7 +78,7 @@ def dior(folder: Path, objects: dict[str, dict[str, list[Object]]]) -> Path:
 
 
 def coco(folder: Path) -> Path:
-    """One file of JSON beside the images; its ids are in an order of their own."""
+    """Write images and one JSON file, whose ids are not in the order of the names."""
     names = sorted({box[0] for box in chain.from_iterable(OBJECTS.values())})
     images: list[dict[str, object]] = []
     annotations: list[dict[str, object]] = []
@@ -92,7 +97,7 @@ def coco(folder: Path) -> Path:
 
 
 def labelled(folder: Path, count: int) -> Path:
-    """Drawn scenes as pictures in sRGB with VOC labels beside them."""
+    """Write drawn scenes as sRGB pictures with VOC labels next to them."""
     full_scale = Sensor.load("pleiades-reference").nominal()
     folder.mkdir()
     for number in range(count):

@@ -1,4 +1,4 @@
-"""Detectors whose answer is known, as ONNX files: what they answer is written into them."""
+"""ONNX files of detectors that return a fixed answer, which is stored in the file."""
 
 from pathlib import Path
 
@@ -29,16 +29,16 @@ def detector(
     channels: int = 3,
     **about: object,
 ) -> Path:
-    """A file that answers `answer` whatever the image, (1, 4 + classes, anchors) or (1, N, 6).
+    """Write a detector that returns `answer` for any image.
 
     Args:
-        path: of the file.
-        answer: what it answers.
-        size_px: of the input; a text leaves it open.
-        cut: of a suppression inside the file, its confidence.
-        outputs: how many times the answer is given.
-        channels: of the input.
-        about: metadata; None leaves one out.
+        path: the file to write.
+        answer: the result, (1, 4 + classes, anchors) or (1, N, 6).
+        size_px: the side of the input; a text leaves it open.
+        cut: the confidence threshold of a suppression inside the file, None for no suppression.
+        outputs: the number of outputs, which all have the answer.
+        channels: the number of channels of the input.
+        about: metadata; None omits an entry.
     """
     metadata = {"names": NAMES, "task": "detect", "stride": 32, "imgsz": [64, 64], **about}
     sizes = ",".join(map(str, answer.shape))
@@ -72,8 +72,9 @@ def detector(
 
 
 def raw(*rows: tuple[float, ...], anchors: int = 20) -> np.ndarray:
-    """Centre, size and a score of each class, a row a box, as (1, 4 + classes, anchors); the rest
-    is nothing.
+    """Return boxes in the raw layout (1, 4 + classes, anchors), padded with zeros.
+
+    Each row is a box: centre, size and a score for each class.
     """
     answer = np.zeros((anchors, 4 + len(NAMES)), np.float32)
     answer[: len(rows)] = np.reshape(rows, (-1, answer.shape[1]))
@@ -81,7 +82,10 @@ def raw(*rows: tuple[float, ...], anchors: int = 20) -> np.ndarray:
 
 
 def final(*rows: tuple[float, ...], count: int = 300) -> np.ndarray:
-    """Corners, score and class, a row a box, as (1, 300, 6), padded with zeros."""
+    """Return boxes in the final layout (1, 300, 6), padded with zeros.
+
+    Each row is a box: corners, score and class.
+    """
     answer = np.zeros((count, 6), np.float32)
     answer[: len(rows)] = np.reshape(rows, (-1, answer.shape[1]))
     return answer[None]

@@ -1,5 +1,5 @@
-"""Scores of boxes are those of pycocotools, whatever the weights; intervals say no more than the
-sites allow.
+"""Test that scores of boxes are those of pycocotools for any weights, and that intervals state no
+more than the sites allow.
 """
 
 import io
@@ -33,13 +33,13 @@ SEEDS = st.integers(0, 2**32 - 1)
 ONE = np.array([[10.0, 10.0, 20.0, 20.0]])
 
 Pairs = list[tuple[Boxes, Boxes]]
-"""What is labelled on each image, and what was found."""
+"""For each image, the labelled boxes and the detected boxes."""
 
 
 def drawn(rng: np.random.Generator, images: int, ties: bool = False) -> Pairs:
-    """Objects of all sizes: some found well, some badly or as another class, and false ones beside.
+    """Draw objects of all sizes, and detections: good, bad, of a wrong class, and false ones.
 
-    With `ties` scores are of ten values; else no two are alike.
+    With `ties` the scores have few values. Otherwise no two are equal.
     """
     pairs = []
     for _ in range(images):
@@ -80,8 +80,9 @@ def scored(
 
 
 def by_pycocotools(pairs: Pairs, size: str = "all") -> np.ndarray:
-    """Average precision by class and overlap, (3, 10), NaN where a class has no object: all of it
-    by the library.
+    """Compute the average precision by class and overlap, (3, 10), with pycocotools alone.
+
+    It is NaN where a class has no object.
     """
     with redirect_stdout(io.StringIO()):
         evaluation = COCOeval(_table([t for t, _ in pairs]), _table([f for _, f in pairs]), "bbox")
@@ -124,7 +125,7 @@ def _table(images: Sequence[Boxes]) -> COCO:
     st.booleans(),
     st.sampled_from(list(SIZES_PX)),
 )
-def test_a_weight_is_as_good_as_so_many_copies_to_pycocotools(
+def test_a_weight_counts_like_as_many_copies_for_pycocotools(
     seed: int, weights: list[int], ties: bool, size: str
 ) -> None:
     pairs = drawn(np.random.default_rng(seed), len(weights), ties)
@@ -221,7 +222,7 @@ def test_a_class_that_no_site_of_a_draw_holds_drops_out() -> None:
     assert interval(figures["mAP50 of tank"], 5) == (0.0, 0.0)
 
 
-def test_below_five_sites_there_is_no_interval_and_below_ten_it_is_said_to_be_narrow() -> None:
+def test_below_five_sites_there_is_no_interval_and_below_ten_a_warning() -> None:
     values = np.linspace(0.2, 0.4, 50)
     assert interval(values, 4) is None
     assert interval(values, 5) is not None

@@ -1,4 +1,4 @@
-"""Suppression and the letterbox, at any size."""
+"""Tests of suppression and of the letterbox, at any size."""
 
 import numpy as np
 import pytest
@@ -46,10 +46,10 @@ def test_suppression_keeps_the_best_and_no_more_than_300() -> None:
 
 @settings(max_examples=25)
 @given(SIDES, SIDES, st.integers(3, 8))
-def test_pixels_go_where_the_letterbox_takes_their_box(
+def test_pixels_and_boxes_are_moved_alike_by_the_letterbox(
     height: int, width: int, eighths: int
 ) -> None:
-    """Of an image whose pixels say where they are."""
+    """The values of this image are the coordinates of its pixels."""
     height = 3 * height + 40
     width = 3 * width + 41
     size = 32 * eighths + 1
@@ -76,7 +76,7 @@ def test_an_image_of_which_nothing_would_be_left_is_refused() -> None:
         Letterbox(3, 5000, 256)
 
 
-def test_what_is_mostly_outside_is_ignored_and_what_is_outside_is_none() -> None:
+def test_boxes_mostly_outside_are_ignored_and_boxes_outside_are_dropped() -> None:
     corners = np.array(
         [[-8, 0, 2, 10], [-5, 0, 5, 10], [-20, 0, -10, 10], [95, 95, 120, 105], [10, 10, 20, 20]]
     )

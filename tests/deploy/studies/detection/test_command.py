@@ -1,5 +1,5 @@
-"""`evaluate --detector` from options to a page: on a labelled folder, and on what is refused; and
-the demonstration of the small detector on drawn scenes.
+"""Tests of `evaluate --detector` from options to a page, of its refusals, and of the demonstration
+of the small detector on drawn scenes.
 """
 
 from pathlib import Path
@@ -17,9 +17,7 @@ pytestmark = pytest.mark.slow
 
 
 def document(path: Path) -> dict[str, dict[str, dict[str, float]]]:
-    """Values by table, row and figure, of a document that the schema takes; 0
-    where there is none.
-    """
+    """Return the values of a valid document by table, row and figure; 0 for a missing value."""
     tables: dict[str, dict[str, dict[str, float]]] = {}
     for row in valid(path)["rows"]:
         tables.setdefault(row["table"], {})[row["name"]] = {
@@ -89,7 +87,7 @@ def test_dior_s_tree_is_read_and_nothing_in_it_is_written_over(tmp_path: Path) -
         (["--brightness", "0.5"], "--brightness has no effect with --detector"),
     ],
 )
-def test_what_cannot_be_is_one_sentence(
+def test_a_wrong_option_is_refused_in_one_sentence(
     arguments: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

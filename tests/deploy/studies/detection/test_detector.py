@@ -1,5 +1,5 @@
-"""Files of both layouts give the boxes that they answer, on the image; any other file is refused by
-one sentence.
+"""Test that files of both layouts return their boxes in image coordinates, and that any other file
+is refused in one sentence.
 """
 
 from pathlib import Path
@@ -13,7 +13,7 @@ from beers_deploy.studies.detection.detector import class_numbers, open_detector
 from tests.deploy.studies.detection.networks import NAMES, detector, final, raw
 
 IMAGE = np.full((32, 64, 3), 0.5, np.float32)
-"""In an input of 64 px it stays of its size, 16 px of grey above it and below."""
+"""An input of 64 px does not resize it, and has 16 px of grey above and below it."""
 ONE = raw((1, 1, 1, 1, 0.5, 0))
 
 
@@ -74,7 +74,7 @@ def test_the_size_is_the_file_s_or_the_one_asked_for(tmp_path: Path) -> None:
         (np.zeros((4, 300, 6)), {}, "output 4 x 300 x 6"),
     ],
 )
-def test_another_layout_is_refused_by_what_is_read(
+def test_another_layout_is_refused_with_the_values_that_were_read(
     answer: np.ndarray, options: dict[str, Any], sentence: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ModelError, match=sentence):
@@ -101,13 +101,13 @@ def test_an_answer_that_is_no_detection_is_refused(
         net.decoded(answer)
 
 
-def test_no_more_than_300_boxes_are_given(tmp_path: Path) -> None:
-    """Of the final layout: suppression of the raw one keeps no more itself."""
+def test_at_most_300_boxes_are_returned(tmp_path: Path) -> None:
+    """The final layout is cut to 300. In the raw layout, suppression keeps at most 300 itself."""
     many = final(*[(1, 1, 2, 2, 0.5, 0)] * 400, count=400)
     assert len(open_detector(detector(tmp_path / "b.onnx", many), 1).decoded(many)) == 300
 
 
-def test_a_class_is_found_by_its_letters_or_by_what_the_user_says() -> None:
+def test_a_class_is_matched_by_its_letters_or_by_the_users_mapping() -> None:
     labelled = ("car", "Storage-Tank", "minibus", "Tree")
     detector = ("ship", "vehicle", "storagetank")
     assert class_numbers(labelled, detector, {"car": "Vehicle"}).tolist() == [1, 2, -1, -1]

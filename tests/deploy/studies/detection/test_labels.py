@@ -1,5 +1,5 @@
-"""Every layout gives the same boxes of the same labels; what none of them is, is refused by one
-sentence.
+"""Test that every layout of the same labels gives the same boxes, and that any other folder is
+refused in one sentence.
 """
 
 import json
@@ -52,7 +52,7 @@ def refused(folder: Path, sentence: str) -> None:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_every_layout_says_the_same_of_the_same_boxes(layout: str, tmp_path: Path) -> None:
+def test_every_layout_of_the_same_labels_gives_the_same_boxes(layout: str, tmp_path: Path) -> None:
     labelled = read_labelled(LAYOUTS[layout](tmp_path))
     assert labelled.names == ["Expressway-Service-area", "ship"]
     assert boxes_of(labelled) == OBJECTS
@@ -117,7 +117,7 @@ def test_the_four_photographs_are_read_with_their_boxes(shared_data: Path) -> No
     assert labelled.notes == []
 
 
-def test_boxes_outside_or_without_area_are_left_out_and_told(tmp_path: Path) -> None:
+def test_boxes_outside_or_without_area_are_left_out_and_counted(tmp_path: Path) -> None:
     boxes: list[Object] = [("ship", 5, 5, 9, 9), ("ship", 70, 5, 90, 9), ("ship", 9, 9, 9, 20)]
     by_voc(tmp_path, xml(boxes))
     labelled = read_labelled(tmp_path)
@@ -207,14 +207,14 @@ def test_a_faulty_coco_file_is_refused_by_a_sentence(
     refused(tmp_path, sentence)
 
 
-def test_files_of_labels_without_an_image_are_told(tmp_path: Path) -> None:
+def test_files_of_labels_without_an_image_are_counted(tmp_path: Path) -> None:
     text(voc(tmp_path) / "00003.xml", SHIP)
     assert read_labelled(tmp_path).notes == [
         f"1 of 3 files of labels in {tmp_path} are of no image."
     ]
 
 
-def test_images_that_coco_does_not_list_are_told_and_one_listed_twice_is_refused(
+def test_images_that_coco_does_not_list_are_counted_and_one_listed_twice_is_refused(
     tmp_path: Path,
 ) -> None:
     path = coco(tmp_path) / "labels.json"
@@ -241,7 +241,7 @@ def test_labels_of_which_no_object_counts_are_refused(tmp_path: Path) -> None:
     refused(tmp_path, "at least one object that counts, but they have none on 2 images")
 
 
-def test_what_coco_lists_and_the_folder_lacks_is_told_and_a_crowd_need_not_be_found(
+def test_images_missing_from_the_folder_are_counted_and_a_crowd_need_not_be_found(
     tmp_path: Path,
 ) -> None:
     path = coco(tmp_path) / "labels.json"

@@ -1,6 +1,4 @@
-"""A study with a detector that finds what is bright: where its boxes lie, what follows of it, and
-what is shown.
-"""
+"""Tests of a study whose detector finds bright objects: its boxes, its figures and its pictures."""
 
 from dataclasses import replace
 
@@ -55,7 +53,7 @@ def scene(
 
 
 def bright(image: np.ndarray) -> np.ndarray:
-    """The box around what is bright in an input, in the raw layout."""
+    """Return the box around the bright pixels of an input, in the raw layout."""
     places = np.argwhere(image[0, 0] > 0.75)[:, ::-1]
     answer = np.zeros((1, 6, 21), np.float32)
     low = places.min(0)
@@ -114,7 +112,7 @@ def rows_of(comparison: Comparison, table: str = "detection, dior-high") -> dict
     return {row.name: row for row in detection_rows(comparison) if row.table == table}
 
 
-def test_a_loss_and_what_is_regained_of_it() -> None:
+def test_a_loss_and_the_share_of_it_that_is_regained() -> None:
     comparison = handmade(reference=12, degraded=3, traditional=9)
     rows = rows_of(comparison)
     ap = {name: row.figures["mAP50"].value for name, row in rows.items()}

@@ -1,4 +1,4 @@
-"""`evaluate --calibrate`: the interval of a user's network, fitted on pairs."""
+"""Tests of `evaluate --calibrate`: the interval of a user's network, fitted on pairs."""
 
 from itertools import product
 from pathlib import Path
@@ -28,7 +28,7 @@ IMAGES = 4
 
 
 def smooth_pair(name: str, seed: int, size: int = 96) -> NamedPair:
-    """A pair whose degraded image differs from the reference by noise of 30 DN."""
+    """Return a pair whose degraded image differs from the reference by noise of 30 DN."""
     generator = np.random.default_rng(seed)
     reference = np.full((size, size), 900, np.float32)
     degraded = np.rint(reference + generator.normal(0, 30, reference.shape))
@@ -36,7 +36,7 @@ def smooth_pair(name: str, seed: int, size: int = 96) -> NamedPair:
 
 
 def pairs_of(sites: str = SITES, images: int = IMAGES) -> list[NamedPair]:
-    """Pairs of some sites, so many of each."""
+    """Return `images` pairs of each site."""
     named = [f"{site}_{frame}.tif" for site, frame in product(sites, range(images))]
     return [smooth_pair(name, seed) for seed, name in enumerate(named)]
 
@@ -51,7 +51,7 @@ def test_the_interval_covers_pairs_that_it_did_not_see() -> None:
     half = width.of(new.degraded, np.ones(new.degraded.shape, bool))
     inner = (slice(BORDER_PX, -BORDER_PX),) * 2
     within = np.abs(new.degraded - new.reference)[inner] <= half[inner]
-    # The weight of the image to come takes 1 / 60 of the level more.
+    # The weight of the new image raises the level by 1 / 60 of it.
     assert within.mean() == pytest.approx(0.915, abs=0.02)
 
 
@@ -63,7 +63,7 @@ def test_pairs_of_one_site_are_refused() -> None:
 def test_a_copy_of_a_network_restores_with_the_interval(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The network of the user gets an interval, and restores as before."""
+    """The copy of the user's network has an interval, and restores as the network did."""
     few_targets(monkeypatch)
     mine = tmp_path / "mine.onnx"
     network = bd.Network.load("convbeers-xs", sensor="pleiades-degraded")

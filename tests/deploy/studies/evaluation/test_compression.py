@@ -1,4 +1,4 @@
-"""Restoration before and after compression: the codec, the noise of the profile, and the tables."""
+"""Tests of restoration before and after compression: codec, noise of the profile, and tables."""
 
 import numpy as np
 import pytest
@@ -146,7 +146,7 @@ def trial(ground: list[list[float]], sites: str, board: float = 40.0) -> Trial:
     ],
 )
 def test_other_sites_choose_the_share(sites: str, whole_at_a: float, chosen: list[int]) -> None:
-    """Site a is best without more noise, whatever the others need; one site alone decides."""
+    """The share of a site is the best one for the other sites. A single site decides for itself."""
     ground = [[39.0] * 2 + [30.0] * 3, [whole_at_a] * 2 + [33.0] * 3]
     assert trial(ground, sites).chosen.tolist() == chosen
 

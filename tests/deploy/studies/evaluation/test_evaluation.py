@@ -1,4 +1,4 @@
-"""The command `evaluate`, the images that its page shows, and its tables."""
+"""Tests of the command `evaluate`, of the images on its page, and of its tables."""
 
 from pathlib import Path
 

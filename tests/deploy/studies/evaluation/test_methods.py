@@ -1,4 +1,4 @@
-"""Methods of an evaluation by their names, and which sensor each is given."""
+"""Tests of the methods of an evaluation by name, and of the sensor that each is given."""
 
 import logging
 from pathlib import Path
@@ -42,15 +42,15 @@ def test_an_unknown_method_is_refused(name: str) -> None:
         ("traditional", "known"),
     ],
 )
-def test_a_shipped_network_knows_the_images_sensor_unless_its_name_says_another(
+def test_a_shipped_network_is_given_the_images_sensor_unless_its_name_states_another(
     name: str, expected: str
 ) -> None:
     assert method_named(name, DEGRADED, REFERENCE).sensor_known == expected
 
 
 @pytest.mark.parametrize("name", ["traditional-fast", "deconvolve-first-fast", "wiener"])
-def test_a_chain_that_gets_to_know_a_sensor_is_the_one_made_for_it(name: str) -> None:
-    """Its gain included: the reference that is aimed at then has it too."""
+def test_a_chain_that_is_given_a_sensor_is_the_one_made_for_it(name: str) -> None:
+    """This includes the gain: the reference that the chain aims at has the gain of that sensor."""
     dn = np.random.default_rng(0).integers(200, 1800, (40, 47)).astype(np.float32)
     method = method_without_network(name, *SENSORS)
     other = method_without_network(name, OTHER, SENSORS[1].in_units_of(OTHER))
@@ -59,7 +59,7 @@ def test_a_chain_that_gets_to_know_a_sensor_is_the_one_made_for_it(name: str) ->
     assert not np.array_equal(restored, method.restore(dn))
 
 
-def test_who_can_know_a_sensor_says_so_and_what_depends_on_none_stays_as_it_is() -> None:
+def test_a_method_given_a_sensor_states_so_and_one_that_accepts_none_is_unchanged() -> None:
     for fixed in (method_without_network("degraded", *SENSORS), Method("blind", np.sqrt, BLIND)):
         assert fixed.with_sensor(OTHER) is fixed
     method = Method("net", np.sqrt, BLIND, lambda _: np.abs)
@@ -67,7 +67,7 @@ def test_who_can_know_a_sensor_says_so_and_what_depends_on_none_stays_as_it_is()
 
 
 def test_a_file_for_every_sensor_is_the_method_of_its_shipped_name() -> None:
-    """It knows the sensor of the images, and gets to know others, but no name with another one."""
+    """It is given the sensor of the images, and accepts others. A name with a sensor is fixed."""
     dn = np.random.default_rng(0).uniform(300, 900, (40, 47)).astype(np.float32)
     name = "convbeers-xs-int8"
     method = method_named(str(SHIPPED / f"{name}.onnx"), DEGRADED, REFERENCE)

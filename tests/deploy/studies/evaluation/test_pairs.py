@@ -1,4 +1,4 @@
-"""Pairs of an evaluation: read from a folder, or simulated from scenes."""
+"""Tests of the pairs of an evaluation: read from a folder, or simulated from scenes."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -63,7 +63,7 @@ def test_scenes_too_small_are_named_and_all_too_small_is_refused() -> None:
         (5, (700, 700), "pixel: 4, where pleiades-degraded states 5; at most 4 are taken"),
     ],
 )
-def test_another_oversampling_than_the_profiles_is_said(
+def test_another_oversampling_than_the_profiles_is_noted(
     own: int, sides: tuple[int, int], words: str
 ) -> None:
     profile = replace(DEGRADED, oversampling=Constant(own, "stated", "a test"))
@@ -75,9 +75,7 @@ def test_another_oversampling_than_the_profiles_is_said(
 
 
 def test_the_reference_without_noise_is_the_same_acquisition_otherwise() -> None:
-    """What is left between the two is the reference sensor's noise and rounding; the pair's bytes
-    are as ever.
-    """
+    """The references differ by the sensor's noise and rounding. The pair itself is unchanged."""
     scene = procedural_scene(700, 760, np.random.default_rng(3))
     (one,), _ = simulate_pairs([scene], DEGRADED, REFERENCE, 7)
     expected = simulate_pair(scene.radiance, *SENSORS, 4, Draw(7))

@@ -1,4 +1,4 @@
-"""Scores of restored pairs: which pixels count, biases, and means by site."""
+"""Tests of the scores of restored pairs: which pixels count, biases, and means by site."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ from tests.deploy.studies.evaluation.small_pairs import (
 
 
 def test_clipped_pixels_do_not_count() -> None:
-    """Trap 17: above full scale the truth is unknown, in the reference as in the input."""
+    """Above full scale the truth is unknown, in the reference as in the input (trap 17)."""
     one = pair()
     one.reference[3:9, 5:11] = 4095
     one.degraded[20:25, 5:11] = 4095
@@ -45,7 +45,7 @@ def test_clipped_pixels_do_not_count() -> None:
     restored[30, 30] += 500
     assert fidelity_db(restored, one.reference, one.degraded) < before
     white = np.full((12, 13), 4095, np.float32)
-    # All of the image is clipped: then no pixel is left out.
+    # If the whole image is clipped, no pixel is left out.
     assert fidelity_db(white - 1, white, white) == pytest.approx(20 * np.log10(4095))
 
 
@@ -65,7 +65,7 @@ def test_the_degraded_input_gains_nothing_and_missing_figures_have_a_reason() ->
     assert "no interval: 4 sites, fewer than 5" in few.figures["PSNR"].source
 
 
-def test_errors_in_the_border_are_none_of_inner_pixels() -> None:
+def test_errors_in_the_border_do_not_count_for_inner_pixels() -> None:
     for height, width in ((37, 45), (300, 131)):
         border_px = inner_border_px(height, width)
         generator = np.random.default_rng(height)
@@ -84,7 +84,7 @@ def test_errors_in_the_border_are_none_of_inner_pixels() -> None:
         assert scores[BIAS] == pytest.approx(200 / clean[inside].mean(), rel=1e-3)
 
 
-def test_the_border_covers_what_every_shipped_network_sees_and_is_less_of_small_images() -> None:
+def test_the_border_covers_every_shipped_networks_halo_and_is_narrower_in_small_images() -> None:
     reach_of_the_consistency_step_px = 19
     halos_px = [Network.load(name).tiling.halo_px for name in shipped_names()]
     assert max(halos_px) + reach_of_the_consistency_step_px == INNER_BORDER_PX

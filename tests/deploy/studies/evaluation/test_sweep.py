@@ -1,5 +1,5 @@
-"""Conditions of a sweep: who is told which sensor, and what a chain loses when it is told the wrong
-one.
+"""Tests of the conditions of a sweep: which sensor each method is given, and the loss of a chain
+that is given the wrong one.
 """
 
 from collections.abc import Callable, Iterator
@@ -37,7 +37,7 @@ WRONG = "MTF 3%, supposed MTF 7%"
 WRONGLY = "sweep, sensor known wrongly", "sweep, lost by a sensor known wrongly"
 
 
-def test_what_is_supposed_wrongly_is_another_sensor_than_the_one_of_a_condition() -> None:
+def test_a_sensor_supposed_wrongly_is_not_the_one_of_the_condition() -> None:
     sensors = conditions(NOMINAL, DEGRADED)
     assert len(sensors) == 16
     for truth, supposed in suppositions(NOMINAL, DEGRADED).items():
@@ -58,7 +58,7 @@ def half(dn: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module", autouse=True)
 def quick() -> Iterator[None]:
-    """Three conditions, on targets that are small and seen once."""
+    """Sweep three conditions only, on small targets that are acquired once."""
     with pytest.MonkeyPatch.context() as patch:
         few_targets(patch)
         three = {"nominal": NOMINAL, "MTF 3%": DRIFTED, "dim": DIM}
@@ -68,9 +68,7 @@ def quick() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def swept(tmp_path_factory: pytest.TempPathFactory) -> Swept:
-    """One sweep under three conditions: its rows, and the sensors that the able
-    network was given.
-    """
+    """Return the rows of a sweep, and the sensors that the able network was given."""
     specialised: list[Instrument] = []
 
     def specialise(sensor: Instrument) -> Restore:
@@ -92,7 +90,7 @@ def psnr(swept: Swept, condition: str) -> Callable[[str], float]:
 
 
 def test_a_network_that_can_know_the_sensor_knows_that_of_each_condition(swept: Swept) -> None:
-    """Then those that are supposed in its place; it never restores as it does by itself."""
+    """It is then given the supposed sensors. It never restores without a given sensor."""
     supposed_for = suppositions(NOMINAL, DEGRADED)
     supposed = [list(supposed_for[name].values()) for name in ("nominal", "MTF 3%")]
     assert swept[1] == [NOMINAL, *supposed[0], DRIFTED, *supposed[1], DIM]
@@ -100,10 +98,8 @@ def test_a_network_that_can_know_the_sensor_knows_that_of_each_condition(swept: 
     assert at("half") < at("able") - 3
 
 
-def test_the_truth_pays_where_the_sensor_has_drifted(swept: Swept) -> None:
-    """The reference has the gain of the input, so brightness is no error of a method that knows no
-    gains.
-    """
+def test_knowing_the_true_sensor_helps_where_it_has_drifted(swept: Swept) -> None:
+    """The reference has the gain of the input, so methods that ignore gains keep the brightness."""
     nominal = psnr(swept, "nominal")
     drifted = psnr(swept, "MTF 3%")
     dim = psnr(swept, "dim")
@@ -129,8 +125,9 @@ SITES = ["a", "b", "c", "d", "e", "f"]
 
 
 def synthetic_sweep() -> SweepResult:
-    """Sites differ by 20 dB, the network's lead over the chain by nothing under one condition, a
-    little under two.
+    """Return scores of sites that differ by 20 dB, with a small gain of the network over the chain.
+
+    The gain is equal at all sites under one condition, and differs a little under the other.
     """
     site = np.linspace(30, 50, len(SITES))
     lead = {"nominal": np.full(6, 0.75), "MTF 3%": np.linspace(0.1, 0.5, 6)}

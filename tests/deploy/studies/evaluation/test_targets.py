@@ -1,6 +1,4 @@
-"""Targets whose truth is known: what they say of methods that do nothing,
-scale, blur, or sharpen.
-"""
+"""Tests of targets with a known truth, on methods that do nothing, scale, blur or sharpen."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -27,7 +25,7 @@ from tests.deploy.studies.evaluation.small_pairs import DEGRADED, IDENTITY, REFE
 
 @pytest.fixture(scope="module")
 def raw_targets() -> Iterator[Targets]:
-    """The targets as the degraded sensor sees them, with fewer edges, points and patterns."""
+    """Acquire the targets with the degraded sensor, with fewer edges, points and patterns."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(target_scenes, "REPEATS", 1)
         patch.setattr(target_scenes, "POINTS_A_SIDE", 3)
@@ -37,8 +35,9 @@ def raw_targets() -> Iterator[Targets]:
 
 @pytest.fixture(scope="module")
 def perfect(raw_targets: Targets) -> Targets:
-    """The targets as the reference sensor sees them without noise; the background of points keeps
-    its noise.
+    """Return the targets as the reference sensor acquires them without noise.
+
+    Only the background of the points has its noise.
     """
     points = [
         replace(target, acquired=target.flat + target.expected) for target in raw_targets.points
@@ -59,7 +58,7 @@ def values(row: Row, unit: str) -> list[float]:
 def test_flux_and_contrast_are_the_factor_of_a_linear_method_at_any_level(
     factor: float, perfect: Targets
 ) -> None:
-    """Of the reference by itself, scaled, erased and reversed."""
+    """The method leaves the reference unchanged, halves it, erases it or inverts it."""
     row = target_row(Method("linear", lambda dn: np.float32(factor) * dn + 37, BLIND), perfect)
     assert (row.table, row.name, row.text["sensor"]) == ("targets", "linear", BLIND)
     assert len(row.figures) == 6 + 3 + 2
@@ -88,7 +87,7 @@ def test_flux_and_contrast_of_the_raw_image_are_those_of_its_blur(raw_targets: T
     assert all(0.2 < value < 0.5 for value in values(row, OF_REFERENCE))
 
 
-def test_targets_measure_the_sensor_and_what_a_chain_makes_of_it(raw_targets: Targets) -> None:
+def test_targets_measure_the_sensor_and_the_result_of_a_chain(raw_targets: Targets) -> None:
     assert len(raw_targets.edges) == 4
     before = mean_figures(IDENTITY, raw_targets)
     assert before["MTF at Nyquist"].value == pytest.approx(7, abs=0.7)

@@ -1,6 +1,4 @@
-"""Real studies of next to nothing: few patches, one chain, no other library, and a clock that
-stands still.
-"""
+"""Real but tiny studies: few patches, one chain, no other library, and constant times."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -14,7 +12,7 @@ from beers_deploy.studies.tradeoff import measure, points
 
 @contextmanager
 def small_studies() -> Iterator[None]:
-    """Less of everything."""
+    """Reduce the patches, chains and baselines of a study, and fix its times."""
     with pytest.MonkeyPatch.context() as patch:
         for module, name, value in (
             (measure, "PATCHES", 2),

@@ -1,4 +1,4 @@
-"""Points with figures that were made up, on a real board."""
+"""Points with invented figures, on a real board."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ from beers_deploy.studies.tradeoff.points import INT8, Point, Variant
 
 SITES = ("a", "a", "b", "c", "d", "e")
 DIFFICULTY_DB = np.array([0.0, 1.0, -6.0, 5.0, -2.0, 2.0])
-"""How sites differ: by far more than methods do."""
+"""Differences of PSNR between sites, which are far larger than those between methods."""
 COMPARE = Comparison(SITES, 0)
 DPU = load_dpu("vck190")
 
@@ -33,9 +33,7 @@ def synthetic(
     board: str = "vck190",
     power_w: float = 30.0,
 ) -> Measured:
-    """Make an INT8 network of that name: its scores differ from the mean as sites do, and by some
-    scatter.
-    """
+    """Return an INT8 network whose scores have the differences of the sites and some scatter."""
     noise = np.random.default_rng(sum(map(ord, name))).normal(size=len(SITES))
     values = psnr_db + DIFFICULTY_DB - DIFFICULTY_DB.mean() + scatter_db * (noise - noise.mean())
     network = Network(onnx.ModelProto(), method or name)
@@ -61,7 +59,10 @@ def question(budget: str | None = None, need: str | None = None) -> Question:
 
 
 def family() -> Sequence[Measured]:
-    """Small to large: each better and dearer, the last two alike, and one that is beaten."""
+    """Return networks from small to large, each better and more expensive than the one before.
+
+    The last two are nearly equal, and "slow" is dominated.
+    """
     return [
         synthetic("tiny", 44.0, 0.6),
         synthetic("small", 45.0, 2.0),

@@ -1,4 +1,4 @@
-"""The front and the comparisons of points; constraints, and the one recommended line."""
+"""Tests of the Pareto front, the comparisons of points, constraints, and the recommended line."""
 
 import math
 import re
@@ -56,7 +56,7 @@ def test_no_point_beats_a_member_and_a_member_is_as_good_as_each_point(
         assert any(c <= cost and q >= quality for c, q in members)
 
 
-def test_what_lacks_a_figure_or_was_published_is_not_on_the_front() -> None:
+def test_points_without_a_figure_or_published_are_not_on_the_front() -> None:
     paper = Measured("paper", {COST: published(1, "s", ""), "PSNR": measured(99, "dB", "")}, {})
     lacking = Measured(
         "float", {COST: unavailable("s", "no board"), "PSNR": measured(99, "dB", "")}, {}
@@ -77,7 +77,7 @@ def test_differences_are_paired_and_reach_less_far_than_the_sites_differ() -> No
     assert not significant(COMPARE.difference(small, medium))
 
 
-def test_the_same_pictures_do_not_differ_on_however_few_sites() -> None:
+def test_equal_scores_do_not_differ_however_few_the_sites_are() -> None:
     one = synthetic("one", 45.0, 2.0)
     other = replace(synthetic("one", 45.0, 2.0), name="other")
     difference = Comparison(("a",) * 6, 0).difference(one, other)
@@ -125,7 +125,7 @@ def test_front_rows_compare_each_member_with_the_next_cheaper_one() -> None:
 
 
 def recommendation(budget: str | None = None, need: str | None = None) -> tuple[str | None, str]:
-    """The name of the point to take, and the line that says so."""
+    """Return the name of the recommended point, and the line that recommends it."""
     point, line = recommend(family(), question(budget, need))
     return point.name if point else None, line
 
@@ -156,7 +156,7 @@ def test_every_figure_can_be_limited_in_its_unit(name: str) -> None:
         ("host<=0", "above 0, but it is host p50 <= 0 s/Mpx"),
     ],
 )
-def test_what_is_no_constraint_is_refused(text: str, words: str) -> None:
+def test_an_invalid_constraint_is_refused(text: str, words: str) -> None:
     with pytest.raises(OptionError, match=f"`budget` .*{re.escape(words)}"):
         parse_constraints("budget", text)
 
@@ -171,7 +171,7 @@ def test_a_limit_on_the_wrong_side_is_refused_with_the_right_one(name: str) -> N
 
 
 @given(st.floats(-100, 100), st.floats(0.1, 100), st.booleans())
-def test_a_violation_is_0_where_the_value_keeps_the_limit(
+def test_a_violation_is_0_where_the_value_meets_the_limit(
     value: float, limit: float, at_most: bool
 ) -> None:
     violation = Constraint("PSNR", at_most, limit, "dB").violation(
@@ -190,13 +190,13 @@ def test_a_violation_is_0_where_the_value_keeps_the_limit(
         (None, None, "medium"),
     ],
 )
-def test_the_best_within_a_budget_is_taken_and_the_cheapest_for_a_need(
+def test_the_best_within_a_budget_is_recommended_and_the_cheapest_for_a_need(
     budget: str | None, need: str | None, name: str
 ) -> None:
     assert recommendation(budget, need)[0] == name
 
 
-def test_the_line_has_value_interval_and_mode_and_says_what_only_the_value_keeps() -> None:
+def test_the_line_has_value_interval_and_mode_and_names_limits_that_only_the_value_meets() -> None:
     line = recommendation("latency<=20s")[1]
     assert line.startswith(
         "recommended for board latency <= 20 s: medium: PSNR 45.5 [42.5, 48.5] dB (measured), "
@@ -207,7 +207,7 @@ def test_the_line_has_value_interval_and_mode_and_says_what_only_the_value_keeps
     assert "large has 0.003 [" in recommendation("latency<=60s")[1]
 
 
-def test_where_nothing_keeps_the_limits_the_nearest_is_named() -> None:
+def test_if_no_point_meets_the_limits_the_nearest_is_named() -> None:
     name, line = recommendation("latency<=0.1s")
     assert name is None
     assert line.startswith(

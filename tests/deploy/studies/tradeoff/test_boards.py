@@ -1,5 +1,5 @@
-"""Several boards in one study: their order changes nothing, and each board is recommended or says
-why not.
+"""Tests of several boards in one study: their order changes nothing, and each board is recommended
+or has the reason why not.
 """
 
 from collections.abc import Sequence
@@ -28,9 +28,7 @@ def weighed(
 
 
 def on_boards(costs: dict[str, float], psnr_db: dict[str, float]) -> list[Measured]:
-    """One point for each network and board: its PSNR is the network's, its
-    latency theirs together.
-    """
+    """Return a point for each network and board, with the network's PSNR and a latency of both."""
     points = []
     for board, factor in costs.items():
         for name, quality_db in psnr_db.items():
@@ -71,9 +69,7 @@ def test_the_order_of_the_boards_changes_nothing(
     need: str | None,
     data: st.DataObject,
 ) -> None:
-    """Equal figures on purpose: a tie between two boards must not be won by the one that was named
-    first.
-    """
+    """Many figures are equal, because a tie must not be won by the board that was named first."""
     candidates = [
         replace(
             synthetic("net", psnr_db, cost_s, board=board, power_w=POWER_W[board]),
@@ -124,7 +120,7 @@ def test_a_board_within_the_limits_is_compared_with_the_recommended_point() -> N
         assert row.figures["board power"].value == POWER_W["slow"]
 
 
-def test_what_a_board_lacks_or_refuses_is_said_with_its_reason() -> None:
+def test_a_figure_or_network_that_a_board_lacks_is_reported_with_the_reason() -> None:
     points = on_boards({"fast": 1.0, "slow": 3.0}, NETWORKS)
     for point in points:
         if point.text["board"] == "slow":

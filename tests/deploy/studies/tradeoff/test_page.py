@@ -1,4 +1,4 @@
-"""The page: its tables, its plot, and how both look in a browser."""
+"""Tests of the page: its tables, its plot, and how both look in a browser."""
 
 import base64
 import re
@@ -43,7 +43,7 @@ def words_of(result: Tradeoff) -> list[str]:
     return [text.text or "" for text in root.iter(f"{SVG}text")]
 
 
-def test_of_several_boards_a_network_keeps_its_colour_and_a_board_its_marker() -> None:
+def test_with_several_boards_a_network_has_its_own_colour_and_a_board_its_own_marker() -> None:
     points = [
         replace(synthetic(name, 45.0, cost, board=board), name=f"{name} {board}")
         for cost, (name, board) in enumerate(product(("one", "other"), ("vck190", "zcu104")), 1)
@@ -77,7 +77,7 @@ def test_the_plot_marks_the_recommended_point_and_the_budget() -> None:
     assert not any("\N{LESS-THAN OR EQUAL TO}" in word for word in words_of(study()))
 
 
-def test_the_pages_plot_is_the_file_beside_it(tmp_path: Path) -> None:
+def test_the_pages_plot_is_the_file_next_to_it(tmp_path: Path) -> None:
     study().report(tmp_path)
     html = (tmp_path / "tradeoff.html").read_text()
     (encoded,) = re.findall(r"data:image/svg\+xml;base64,([^\"]+)", html)
@@ -90,7 +90,7 @@ def test_the_pages_plot_is_the_file_beside_it(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("width_px", "dark", "colours"), [(1280, False, LIGHT), (390, True, DARK)])
-def test_the_page_fits_the_window_follows_the_screen_and_is_sorted_by_a_press(
+def test_the_page_fits_the_window_follows_the_theme_and_is_sorted_by_a_click(
     width_px: int, dark: bool, colours: dict[str, str], tmp_path: Path
 ) -> None:
     look = """const image = document.images[0], root = document.documentElement;

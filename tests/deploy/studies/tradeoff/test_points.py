@@ -1,6 +1,4 @@
-"""Which operating points a study looks at; what is kept of measurements, and
-times on this machine.
-"""
+"""Tests of the operating points that a study compares, their figures, and times on this machine."""
 
 import logging
 import re
@@ -52,7 +50,7 @@ SENSOR = Sensor.load("pleiades-degraded")
 
 @pytest.fixture(scope="module")
 def variant(tmp_path_factory: pytest.TempPathFactory) -> Variant:
-    """An INT8 network of four blocks of 16."""
+    """Write an INT8 network of four blocks of 16 features."""
     path = integer_convbeers(tmp_path_factory.mktemp("net") / "net.onnx", 4, 16)
     return Variant("net", INT8, Network.load(path))
 
@@ -139,7 +137,7 @@ def test_int8_is_compared_on_every_board_and_configuration_in_several_tiles_and_
     assert {point.name for point in other} == {point.name for point in points}
 
 
-def test_float_and_what_a_board_refuses_have_no_board_and_the_reason(variant: Variant) -> None:
+def test_a_float_network_has_no_board_but_a_reason(variant: Variant) -> None:
     board = TargetProfile.load("vck190")
     (point,) = network_points(replace(variant, precision=FLOAT), [board], WHOLE)
     assert point.board is None

@@ -1,4 +1,4 @@
-"""A whole study of a tiny network, from Python and by its command."""
+"""Tests of a whole study of a tiny network, from Python and by its command."""
 
 import math
 from collections.abc import Iterator
@@ -36,7 +36,7 @@ SENSOR = "pleiades-degraded"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A network, two scenes to judge on and one to calibrate on."""
+    """Write a network, two scenes to judge it on, and one to calibrate it on."""
     folder = tmp_path_factory.mktemp("tiny")
     save_network(folder / "narrow.safetensors", plain(Shape(1, 2), seed=3), {"degraded": SENSOR})
     for number in range(SITES + 1):
@@ -57,7 +57,7 @@ def small() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def study(folder: Path, small: None) -> Tradeoff:  # noqa: ARG001
-    """A study of the tiny network on all boards, for the paper's swath."""
+    """Run a study of the tiny network on all boards, for the paper's swath."""
     degraded = Sensor.load(SENSOR)
     asked = Study(
         networks=[str(folder / "narrow.safetensors")],
@@ -107,7 +107,7 @@ def test_exact_halos_give_one_picture_and_smaller_ones_show_seams(
             assert point.value(SEAM_ERROR) > 0
 
 
-def test_two_sites_give_no_interval_and_it_is_said(study: Tradeoff) -> None:
+def test_two_sites_give_no_interval_but_a_note(study: Tradeoff) -> None:
     assert all(point.figures["PSNR"].interval is None for point in own(study))
     assert {row.text["gain over the next cheaper"] for row in study.front_rows} <= {
         "cheapest",
