@@ -1,8 +1,10 @@
 """Functions that add nodes between two convolutions, and list the rules that the network breaks."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 
@@ -14,6 +16,13 @@ from tests.deploy.dpu.graphs import Sketch, Value
 Draw = Callable[[Sketch, str], str]
 DPU = load_dpu("vck190")
 TILE_PX = 288
+
+
+@contextmanager
+def as_written() -> Iterator[None]:
+    """Read files without simplifying them."""
+    with patch("beers_deploy.quant.onnx_file.simplify", lambda model, _: model):
+        yield
 
 
 def broken_rules(path: Path, dpu: Dpu = DPU, tile_px: int = TILE_PX) -> list[str]:
