@@ -1,6 +1,4 @@
-"""A page opened in a real browser, where one is installed; the test is skipped
-where there is none.
-"""
+"""Functions that open a page in a real browser. Without one, the test is skipped."""
 
 import json
 import re
@@ -20,8 +18,9 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stab
 REPORT = """
 addEventListener("load", () => {
   const shown = document.querySelector("iframe").contentDocument;
-  const told = document.createElement("pre");
-  told.id = "told"; told.textContent = JSON.stringify(look(shown)); document.body.append(told);
+  const report = document.createElement("pre");
+  report.id = "report"; report.textContent = JSON.stringify(look(shown));
+  document.body.append(report);
 });
 """
 TIMEOUT_S = 240
@@ -33,23 +32,31 @@ const frame = (address, width) => new Promise((done) => {
   made.src = address;
   document.body.append(made);
 });
-const tell = (report) => fetch("/told", { method: "POST", body: JSON.stringify(report) });
-const drive = async () => { %s };
-drive().then(tell, (error) => tell({ failed: String(error) + error.stack }));
+const send = (report) => fetch("/report", { method: "POST", body: JSON.stringify(report) });
+const run = async () => { %s };
+run().then(send, (error) => send({ failed: String(error) + error.stack }));
 </script></body>"""
 
 
 def browser() -> str:
-    """The path of a browser; the test is skipped where there is none."""
+    """Return the path of a browser, or skip the test if none is installed."""
     path = next(filter(None, map(shutil.which, BROWSERS)), None)
     if path is None:
         pytest.skip("no Chromium or Chrome here to drive the page with")
     return path
 
 
-def seen(page: str, look: str, folder: Path, *, width_px: int = 1280, dark: bool = False) -> Any:
-    """What the body of a script's function `look(document)` returns of a page
-    in a window so wide.
+def inspect_page(
+    page: str, look: str, folder: Path, *, width_px: int = 1280, dark: bool = False
+) -> Any:
+    """Open a page and return the result of a script.
+
+    Args:
+        page: the HTML of the page.
+        look: the body of the script's function `look(document)`.
+        folder: where the page and the browser's profile are written.
+        width_px: the width of the window.
+        dark: whether the reader prefers dark colours.
     """
     frame = f'<iframe width="{width_px}" height="900" srcdoc="{escape(page)}"></iframe>'
     script = f"<script>const look = (document) => {{ {look} }};{REPORT}</script>"
@@ -69,24 +76,24 @@ def seen(page: str, look: str, folder: Path, *, width_px: int = 1280, dark: bool
     dom = subprocess.run(
         command, capture_output=True, text=True, timeout=TIMEOUT_S, check=True
     ).stdout
-    match = re.search(r'<pre id="told">(.*?)</pre>', dom, re.DOTALL)
+    match = re.search(r'<pre id="report">(.*?)</pre>', dom, re.DOTALL)
     assert match, "the script did not run"
     return json.loads(unescape(match[1]))
 
 
 class Server(SimpleHTTPRequestHandler):
-    """Serves a folder, a page with a script in it, and takes what the script tells."""
+    """Serves a folder and a page with a script, and receives the script's report."""
 
     def __init__(
         self, script: str, missing: str, messages: "Queue[Any]", *arguments: Any, directory: str
     ) -> None:
         self.script = script
         self.missing = missing
-        self.told = messages
+        self.messages = messages
         super().__init__(*arguments, directory=directory)
 
     def log_message(self, *_: object) -> None:
-        """Say nothing."""
+        """Write no log."""
 
     def do_GET(self) -> None:
         if self.missing and self.path.endswith(self.missing):
@@ -96,7 +103,7 @@ class Server(SimpleHTTPRequestHandler):
         return self.answer(200, (HARNESS % self.script).encode())
 
     def do_POST(self) -> None:
-        self.told.put(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+        self.messages.put(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
         self.answer(200, b"")
 
     def answer(self, status: int, body: bytes) -> None:
@@ -107,13 +114,13 @@ class Server(SimpleHTTPRequestHandler):
         self.wfile.write(body)
 
 
-def driven(
+def run_script(
     folder: Path, script: str, profile: Path, *, dark: bool = False, missing: str = ""
 ) -> Any:
-    """What a script answers that drives pages of a folder, and may wait for them.
+    """Run a script that opens pages of a folder, and return its report.
 
     Args:
-        folder: that is served.
+        folder: the folder to serve.
         script: the body of an asynchronous function; `frame(address, width)` opens a page.
         profile: an empty folder for the browser.
         dark: whether the reader prefers dark colours.
@@ -122,7 +129,7 @@ def driven(
     command = [
         browser(),
         "--headless",
-        # As above.
+        # Chromium refuses to run as root with its sandbox.
         "--no-sandbox",
         "--disable-gpu",
         "--remote-debugging-port=0",

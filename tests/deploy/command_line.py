@@ -1,4 +1,4 @@
-"""The command line, run in this process."""
+"""Functions that run the command line in this process."""
 
 from typer.testing import CliRunner
 
@@ -9,9 +9,9 @@ def done(command: object, *words: object, code: int = 0) -> str:
     """Run a command, check its exit code, and return its output.
 
     Args:
-        command: its words, of which none contains a blank.
-        words: more of them.
-        code: expected at its end.
+        command: its first words, none of which contains a blank.
+        words: more words.
+        code: the expected exit code.
     """
     result = CliRunner().invoke(app, [*str(command).split(), *map(str, words)])
     assert result.exit_code == code, result.output

@@ -1,4 +1,4 @@
-"""A network small enough for every test, of random weights that are large enough to show a seam."""
+"""Networks small enough for every test, with random weights large enough to show a seam."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from tests.model.networks import behind_a_bank, plain
 
 @pytest.fixture(scope="session")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A float network of one block, 8 features and a receptive radius of 5 px."""
+    """Write a float network of one block, 8 features and a receptive radius of 5 px."""
     network = plain(Variant(blocks=1, features=8))
     with torch.no_grad():
         for value in network.parameters():
@@ -26,7 +26,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def conditioned(tmp_path: Path) -> Path:
-    """Weights of a small conditioned network, as `train --conditioned` leaves them."""
+    """Write weights of a small conditioned network, as `train --conditioned` does."""
     network = behind_a_bank(Variant(blocks=2, features=8), 0.05)
     save_network(tmp_path / "conditioned.safetensors", network, {"degraded": "many"})
     return tmp_path / "conditioned.safetensors"

@@ -1,4 +1,4 @@
-"""Documents as `--json` writes them."""
+"""Functions that read documents as `--json` writes them."""
 
 import json
 from collections.abc import Iterable, Iterator

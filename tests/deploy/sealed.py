@@ -1,9 +1,8 @@
-"""The command line in a process that the kernel ends at its first internet socket, whoever opens
-it.
+"""The command line in a process that the kernel ends at its first internet socket.
 
     python -m tests.deploy.sealed restore raw.tif out.tif
 
-Python's own sockets can be watched from Python; those of native libraries only from below.
+Sockets of Python can be watched in Python, those of native libraries only in the kernel.
 """
 
 import ctypes
@@ -35,12 +34,13 @@ class Program(ctypes.Structure):
 
 
 def seal() -> None:
-    """From here on, socket(AF_INET or AF_INET6) ends this process and its children with SIGSYS.
+    """Let socket(AF_INET or AF_INET6) end this process and its children with SIGSYS.
 
     Raises:
-        OSError: the kernel takes no filters.
+        OSError: the kernel accepts no filters.
     """
-    # After an operation come the numbers of steps to skip if it is true and if it is false.
+    # The second and third numbers are the steps to skip if the operation is true and if it is
+    # false.
     steps = [
         (LOAD, 0, 0, CALL_OFFSET),
         (JUMP_IF_EQUAL, 0, 3, SOCKET_CALL[platform.machine()]),
@@ -54,7 +54,7 @@ def seal() -> None:
     code = b"".join(struct.pack("HBBI", *step) for step in steps)
     program = Program(len(steps), code)
     libc = ctypes.CDLL(None, use_errno=True)
-    # Without privileges the kernel takes a filter only of a process that can gain none.
+    # From a process without privileges, the kernel accepts a filter only if it can gain none.
     if libc.prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) or libc.prctl(
         PR_SET_SECCOMP, SECCOMP_MODE_FILTER, ctypes.byref(program), 0, 0
     ):

@@ -1,5 +1,5 @@
-"""The action and the workflow to copy, run as shell: green on a valid pair, red on a broken or a
-missing one.
+"""Test that the action and the workflow to copy are green for a valid pair, and red for a broken or
+a missing one. Their steps run in a shell.
 """
 
 import json
@@ -35,9 +35,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def networks(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a sound pair, the same with one bias doubled, and in plain/ a network of one
-    sensor alone.
-    """
+    """Write a valid pair, a broken INT8 file, and in plain/ a network of one sensor."""
     folder = tmp_path_factory.mktemp("networks")
     done(f"export --network convbeers-xs --out {folder}/float.onnx")
     shutil.copy(shipped_pair("convbeers-xs")[1], folder / "int8.onnx")
@@ -56,8 +54,8 @@ def runner(tmp_path: Path) -> Runner:
     return job
 
 
-def take(runner: Runner, networks: Path, *names: str) -> None:
-    """Lay networks into models/, as a user's repository has them."""
+def copy_networks(runner: Runner, networks: Path, *names: str) -> None:
+    """Copy networks to models/, where a user's repository has them."""
     (runner.folder / "models").mkdir(exist_ok=True)
     for name in names:
         shutil.copy(networks / name, runner.folder / "models" / name)
@@ -67,8 +65,8 @@ def suite(path: Path) -> ET.Element:
     return ET.parse(path).getroot()  # noqa: S314 - our own text
 
 
-def test_a_sound_pair_is_green(runner: Runner, networks: Path) -> None:
-    take(runner, networks, "float.onnx", "int8.onnx")
+def test_a_valid_pair_is_green(runner: Runner, networks: Path) -> None:
+    copy_networks(runner, networks, "float.onnx", "int8.onnx")
     outputs = runner.run_action(
         {"float": "models/float.onnx", "int8": "models/int8.onnx", "junit": "made/j.xml"}
     )
@@ -86,8 +84,8 @@ def test_a_sound_pair_is_green(runner: Runner, networks: Path) -> None:
 
 
 def test_a_broken_pair_is_red(runner: Runner, networks: Path) -> None:
-    """The first convolution's bias doubled, beside the baseline of the sound pair."""
-    take(runner, networks, "float.onnx", "int8.onnx", "broken.onnx")
+    """The first convolution's bias is doubled, and the baseline is that of the valid pair."""
+    copy_networks(runner, networks, "float.onnx", "int8.onnx", "broken.onnx")
     pair = {"float": "models/float.onnx", "int8": "models/int8.onnx"}
     outputs_before = runner.run_action({**pair, "json": "models/gate.json"})
     assert outputs_before["verdict"] == "passed"
@@ -110,7 +108,7 @@ def test_a_broken_pair_is_red(runner: Runner, networks: Path) -> None:
 def test_a_missing_float_network_is_red_in_one_sentence(
     more: dict[str, str], runner: Runner, networks: Path
 ) -> None:
-    take(runner, networks, "int8.onnx")
+    copy_networks(runner, networks, "int8.onnx")
     outputs = runner.run_action({"float": "models/float.onnx", **more})
     assert runner.red
     assert runner.stderr.count("\n") == 1
@@ -124,7 +122,7 @@ def test_a_missing_float_network_is_red_in_one_sentence(
 def test_without_an_int8_network_it_quantizes_for_the_same_sensor(
     runner: Runner, networks: Path
 ) -> None:
-    take(runner, networks / "plain", "float.onnx")
+    copy_networks(runner, networks / "plain", "float.onnx")
     sensor = runner.folder / "mine.toml"
     shutil.copy(ROOT / "profiles" / "sensors" / f"{SENSOR}.toml", sensor)
     outputs = runner.run_action(
@@ -145,7 +143,7 @@ def test_without_an_int8_network_it_quantizes_for_the_same_sensor(
 def test_a_network_that_quantize_refuses_is_an_error_whose_reason_is_in_the_summary(
     runner: Runner,
 ) -> None:
-    """Also where a good version's document lies at the place of the verdict's."""
+    """This holds also if the document of a version that passed is where the verdict goes."""
     node = onnx.helper.make_node("Sin", ["x"], ["y"], name="odd\n::error::obeyed | `name` <b>")
     ends = [
         onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, 1, "h", "w"])
@@ -171,9 +169,7 @@ def test_a_network_that_quantize_refuses_is_an_error_whose_reason_is_in_the_summ
 
 
 def obeyed(stdout: str) -> list[str]:
-    """Return the workflow commands that GitHub obeys in an output, without what follows their
-    second colons.
-    """
+    """Return the workflow commands that GitHub obeys in an output, up to their second colons."""
     commands = list[str]()
     token = ""
     for line in stdout.splitlines():
@@ -186,7 +182,7 @@ def obeyed(stdout: str) -> list[str]:
     return commands
 
 
-def test_names_are_never_run(runner: Runner) -> None:
+def test_inputs_are_never_run_as_commands(runner: Runner) -> None:
     inputs = dict.fromkeys(
         ("float", "int8", "sensor", "limits"), "$(touch ran) `touch ran` ; touch ran"
     )
@@ -194,7 +190,7 @@ def test_names_are_never_run(runner: Runner) -> None:
     assert not (runner.folder / "ran").exists()
 
 
-def test_the_action_says_what_it_takes() -> None:
+def test_every_input_and_output_of_the_action_is_described() -> None:
     action = read_yaml(ACTION)
     page = (ROOT / "docs" / "how-to" / "gate.md").read_text(encoding="utf-8")
     assert action["inputs"]["sensor"]["default"] == SENSOR
@@ -205,9 +201,7 @@ def test_the_action_says_what_it_takes() -> None:
 
 
 def test_installing_puts_the_command_alone_on_the_path(tmp_path: Path) -> None:
-    """With a Python that writes down what it is asked for, for want of a
-    package index in a test.
-    """
+    """A script in place of Python logs its arguments, because a test has no package index."""
     steps = read_yaml(ACTION)["runs"]["steps"]
     (step,) = (step for step in steps if "pip install" in step.get("run", ""))
     python = tmp_path / "python"
@@ -238,7 +232,7 @@ def test_installing_puts_the_command_alone_on_the_path(tmp_path: Path) -> None:
 
 
 def test_the_workflow_is_green_with_one(runner: Runner, networks: Path) -> None:
-    take(runner, networks / "plain", "float.onnx")
+    copy_networks(runner, networks / "plain", "float.onnx")
     # The workflow's second checkout leaves the limits of the protected branch here.
     limits = runner.folder / "protected" / ".ci" / "gate.toml"
     limits.parent.mkdir(parents=True)

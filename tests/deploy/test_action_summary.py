@@ -1,4 +1,4 @@
-"""The outputs of the action: text of the network under test stays text, whatever it is."""
+"""Test that any text of the network stays text in the outputs of the action."""
 
 import json
 import os
@@ -122,7 +122,7 @@ def workflows() -> list[Path]:
 
 
 def used(path: Path) -> list[str]:
-    """Return the lines of a workflow or an action that take another's action."""
+    """Return the lines of a workflow or an action that use an action of others."""
     lines = [
         line.strip().removeprefix("- ") for line in path.read_text(encoding="utf-8").splitlines()
     ]

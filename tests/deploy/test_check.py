@@ -1,4 +1,4 @@
-"""The command `check`: its tables, its document and its verdict."""
+"""Tests of the command `check`: its tables, its document and its verdict."""
 
 from pathlib import Path
 from typing import Any
@@ -66,7 +66,7 @@ def test_the_document_holds_subgraphs_cuts_and_remarks(tmp_path: Path) -> None:
 
 
 def test_devices_and_refusals_are_shown_and_nodes_in_detail(tmp_path: Path) -> None:
-    """A line for each node is for a closer look; each broken rule has its count and a remedy."""
+    """Nodes are listed with -v only. Each broken rule has its count and a remedy."""
     sketch = Sketch(8)
     path = sketch.save(
         tmp_path / "bad.onnx",
@@ -101,7 +101,7 @@ def test_a_size_that_is_not_known_is_no_zero(tmp_path: Path) -> None:
     assert "its shape is unknown" in output
 
 
-def test_of_a_float_file_check_answers_as_quantize_does(tmp_path: Path) -> None:
+def test_check_and_quantize_agree_on_a_float_file(tmp_path: Path) -> None:
     """Both give the same reason, so that no network passes one and is refused by the other."""
     supported = float_convbeers(tmp_path / "taken.onnx", 1, 8)
     unsupported = tmp_path / "other.onnx"
@@ -116,5 +116,5 @@ def test_of_a_float_file_check_answers_as_quantize_does(tmp_path: Path) -> None:
     assert str(error.value).removesuffix(f" {REMEDY}") in output
 
 
-def test_of_an_int8_file_quantizing_is_not_mentioned(tmp_path: Path) -> None:
+def test_check_of_an_int8_file_does_not_mention_quantize(tmp_path: Path) -> None:
     assert "'quantize'" not in done("check", integer_convbeers(tmp_path / "int8.onnx", 1, 8))

@@ -1,6 +1,4 @@
-"""The command line as a user meets it: help, exit codes, one sentence for each fault, nothing
-half-written.
-"""
+"""Tests of the command line: help, exit codes, one sentence for each fault, no partial files."""
 
 import os
 import subprocess
@@ -32,7 +30,7 @@ def acquisition(path: Path, height: int = 37, width: int = 61) -> Path:
 
 
 def fails(arguments: list[str], *words: str) -> None:
-    """Exit code 2 and one message with these words, after the log if any; no traceback."""
+    """Check that a command ends with 2 and one message with these words, without a traceback."""
     result = runner.invoke(app, arguments)
     assert result.exit_code == 2, result.output
     *log, message = result.stderr.strip().splitlines()
@@ -53,7 +51,7 @@ def test_every_command_has_help_with_an_example(name: str) -> None:
 
 
 def test_commands_without_a_sensor_use_the_same_one() -> None:
-    """A network calibrated on one and judged on another is no fair trial."""
+    """A network that is calibrated on one sensor and judged on another is not judged fairly."""
     group = get_command(app)
     assert isinstance(group, TyperGroup)
     defaults = {}
@@ -106,7 +104,7 @@ def test_version() -> None:
     assert runner.invoke(app, ["--version"]).output == f"beers-deploy {__version__}\n"
 
 
-def test_the_version_in_full_says_what_the_kernels_were_asked() -> None:
+def test_the_verbose_version_lists_libraries_and_int8_kernels() -> None:
     for order in (["--version", "--verbose"], ["--verbose", "--version"]):
         lines = dict(line.split(": ", 1) for line in done(*order).splitlines()[1:])
         assert {
@@ -180,7 +178,7 @@ def test_a_description_is_shown_and_not_obeyed(tmp_path: Path) -> None:
 
 
 def run_with(closing: str, *words: object) -> tuple[int, str]:
-    """The program in a shell that redirects its streams; its exit code and what it still says."""
+    """Run the program with redirected streams, and return its exit code and remaining output."""
     words = (sys.executable, "-m", "beers_deploy", *words)
     line = ["/usr/bin/env", "bash", "-c", f'"$@" {closing}', "bash", *map(str, words)]
     process = subprocess.run(line, capture_output=True, text=True, check=False)
@@ -209,9 +207,7 @@ def test_no_stream_loses_an_image(closing: str, code: int, tmp_path: Path) -> No
 
 @pytest.mark.parametrize("module", ["typing_extensions", "numpy"])
 def test_an_installation_that_does_not_work_is_no_failed_gate(module: str, tmp_path: Path) -> None:
-    """Python ends a program whose libraries do not load with 1, which is the
-    code of a failed gate.
-    """
+    """If a library does not load, Python ends with 1, which is the code of a failed gate."""
     (tmp_path / f"{module}.py").write_text("raise RuntimeError('broken')\n", encoding="utf-8")
     command = [sys.executable, "-m", "beers_deploy", "--version", "-v"]
     process = subprocess.run(

@@ -1,4 +1,4 @@
-"""What a comparison of float and INT8 rests on, and which samples it judges."""
+"""Tests of the inputs of a comparison of float and INT8, and of the samples that it judges."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -41,10 +41,10 @@ def test_a_folder_is_known_by_its_files(change: str, tmp_path: Path) -> None:
     assert (data.inputs == before) == (change == "none")
 
 
-def test_the_judged_file_does_not_choose_its_judges(model: Path) -> None:
-    """Whatever samples it claims to be calibrated on, all are judged, and the claim is a note."""
+def test_the_judged_file_does_not_choose_its_samples(model: Path) -> None:
+    """All samples are judged. Those that the file claims as its calibration are named in a note."""
     samples = np.random.default_rng(0).random((12, 1, 32, 40), np.float32)
-    # Given one after the other, they can be read only once.
+    # An iterator can be read only once.
     int8 = bd.quantize(model, samples=iter(samples[:8]))
     mixed = np.concatenate([samples[10:], samples[2:7]])
     comparison = bd.compare(int8, samples=mixed)
@@ -60,7 +60,7 @@ def test_the_judged_file_does_not_choose_its_judges(model: Path) -> None:
     assert "7 of the 7 samples" in second.notes[0]
 
 
-def test_samples_without_contrast_judge_nothing() -> None:
+def test_samples_without_contrast_are_not_judged() -> None:
     samples = np.zeros((5, 1, 32, 40), np.float32)
     with pytest.raises(ImageError, match="contrast"):
         bd.compare("convbeers-xs", samples=samples)

@@ -45,7 +45,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def dataset(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The small dataset, to be read."""
+    """Write the small dataset, which tests only read."""
     folder = tmp_path_factory.mktemp("made") / "all"
     write_dataset(small(scene), folder, 1, resume=False)
     return folder
@@ -72,14 +72,14 @@ def test_the_bytes_do_not_depend_on_the_workers(scene: Path, tmp_path: Path) -> 
     assert bytes_of(tmp_path / "1") == bytes_of(tmp_path / "2")
 
 
-def test_any_patch_can_be_made_again_alone(scene: Path, dataset: Path) -> None:
+def test_any_patch_can_be_simulated_again_alone(scene: Path, dataset: Path) -> None:
     window = plan_windows(small(scene))[7]
     (patch,) = make_patches(small(scene), [window])
     for role, dn in (("degraded", patch.degraded), ("reference", patch.reference)):
         np.testing.assert_array_equal(dn, tifffile.imread(dataset / role / f"{window.name}.tif"))
 
 
-def test_the_manifest_tells_where_each_patch_comes_from(scene: Path, dataset: Path) -> None:
+def test_the_manifest_records_the_origin_of_each_patch(scene: Path, dataset: Path) -> None:
     lines = [json.loads(line) for line in (dataset / "manifest.jsonl").read_text().splitlines()]
     assert len(lines) == len(plan_windows(small(scene)))
     assert [line["number"] for line in lines] == list(range(len(lines)))
@@ -134,12 +134,12 @@ def flip(path: Path, share: float = 0.5) -> None:
 
 
 def cut(path: Path) -> None:
-    """Leave less of a file, which ends within a line."""
+    """Truncate a file within a line."""
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
 def swap(path: Path) -> None:
-    """Put another image of the dataset in an image's place."""
+    """Replace an image by another image of the dataset."""
     path.write_bytes(sorted(path.parent.iterdir())[-1].read_bytes())
 
 
@@ -158,11 +158,11 @@ DAMAGES: dict[str, tuple[str, Callable[[Path], None], int]] = {
     "manifest cut": ("manifest.jsonl", cut, 0),
     "manifest grown": ("manifest.jsonl", grow, 0),
 }
-"""A file, what happens to it, and how many pairs that concerns (0: not counted here)."""
+"""For each damage: the file, the damage, and the number of damaged pairs (0: not counted)."""
 
 
 @pytest.mark.parametrize("kind", DAMAGES)
-def test_damaged_pairs_of_a_finished_dataset_are_made_again(
+def test_damaged_pairs_of_a_finished_dataset_are_simulated_again(
     kind: str, scene: Path, dataset: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     name, damage, count = DAMAGES[kind]
@@ -191,7 +191,7 @@ FORGED: dict[str, Callable[[Line], object]] = {
 
 
 @pytest.mark.parametrize("kind", FORGED)
-def test_a_forged_line_with_its_digest_is_made_again(
+def test_a_forged_line_with_its_digest_is_simulated_again(
     kind: str, scene: Path, dataset: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = Path(shutil.copytree(dataset, tmp_path / "forged"))
@@ -206,7 +206,7 @@ def test_a_forged_line_with_its_digest_is_made_again(
     assert caplog.messages[0].startswith("1 of ")
 
 
-def test_left_overs_of_a_run_are_deleted_and_nothing_else(
+def test_only_partial_files_of_a_run_are_deleted(
     scene: Path, dataset: Path, tmp_path: Path
 ) -> None:
     folder = Path(shutil.copytree(dataset, tmp_path / "left"))
@@ -220,7 +220,7 @@ def test_left_overs_of_a_run_are_deleted_and_nothing_else(
 
 
 @pytest.mark.parametrize("damage", [flip, Path.unlink])
-def test_a_damaged_part_of_an_unfinished_dataset_is_made_again(
+def test_a_damaged_part_of_an_unfinished_dataset_is_simulated_again(
     damage: Callable[[Path], None], scene: Path, dataset: Path, tmp_path: Path
 ) -> None:
     folder = Path(shutil.copytree(dataset, tmp_path / "unfinished"))
@@ -285,7 +285,7 @@ def test_effects_are_added_and_forbidden() -> None:
             calling_for(profile, None, ["prnu", name], [name])
 
 
-def test_each_effect_says_who_asks_for_it() -> None:
+def test_each_effect_has_its_origin() -> None:
     profile = Sensor.load("pleiades-degraded")
     haze = SceneCall.load("haze-over-sea")
     base = {"mtf": "sensor pleiades-degraded", "noise": "sensor pleiades-degraded"}
@@ -307,7 +307,7 @@ def test_each_effect_says_who_asks_for_it() -> None:
 
 @pytest.fixture(scope="module")
 def scheduler() -> Iterator[str]:
-    """The address of a scheduler with two workers."""
+    """Yield the address of a scheduler with two workers."""
     pytest.importorskip("distributed", reason="the extra 'dask' is not installed")
     with local_cluster(2) as local:
         yield str(local.scheduler_address)
@@ -392,6 +392,8 @@ def test_options_that_do_not_go_together_are_refused(
         ({"images": ["a.tif", "b.tif"]}, "`images` must be one scene without `out`, got 2"),
     ],
 )
-def test_what_a_pair_does_not_have_is_refused(options: dict[str, Any], words: str) -> None:
+def test_options_that_a_single_pair_does_not_use_are_refused(
+    options: dict[str, Any], words: str
+) -> None:
     with pytest.raises(OptionError, match=words):
         simulate(**options)

@@ -61,9 +61,7 @@ def test_torch_and_onnxruntime_agree_on_shipped_weights(name: str) -> None:
 def test_a_network_behind_a_bank_is_exported_for_one_sensor(
     scale: int, rows: int, columns: int
 ) -> None:
-    """Its filters, unit and head's bias are constants then; tiled, with mirrored borders, it gives
-    the same.
-    """
+    """Its filters, unit and head's bias are constants then, and its results are those of torch."""
     banked = behind_a_bank(Variant(1, 8, scale), 0.1)
     sensor = Sensor.load("pleiades-degraded").nominal()
     model = banked_to_onnx(Weights(arrays(banked.state_dict()), banked.variant, {}), sensor, {})
@@ -83,7 +81,7 @@ def test_a_network_behind_a_bank_is_exported_for_one_sensor(
 def test_a_network_that_gives_nan_is_not_exported(network: ConvBEERS, tmp_path: Path) -> None:
     weights = tmp_path / "run.safetensors"
     out = tmp_path / "float.onnx"
-    # A far too high learning rate leaves such weights: they are finite, the pixels are not.
+    # A far too high learning rate leads to such weights: they are finite, but the pixels are not.
     overflowing = ConvBEERS(network.variant)
     state = {name: value * 1e25 for name, value in network.state_dict().items()}
     overflowing.load_state_dict(state)
@@ -96,12 +94,12 @@ def test_a_network_that_gives_nan_is_not_exported(network: ConvBEERS, tmp_path: 
     done(f"export --network {weights} --out {out}")
 
 
-def test_an_export_that_computes_something_else_is_refused(network: ConvBEERS) -> None:
+def test_an_export_with_other_results_is_refused(network: ConvBEERS) -> None:
     with pytest.raises(ModelError, match="report it"):
         require_parity(plain(network.variant, seed=1), to_onnx(network, {}), 33)
 
 
-def test_plain_weights_take_no_sensor_and_conditioned_ones_the_default(
+def test_plain_weights_accept_no_sensor_and_conditioned_ones_use_the_default(
     network: ConvBEERS, conditioned: Path, tmp_path: Path
 ) -> None:
     plain_weights = tmp_path / "plain.safetensors"
@@ -122,10 +120,10 @@ SMALL = "convbeers-xs-int8"
     ("sensor", "factors"),
     [("pleiades-degraded", [0.5, 4, 16]), ("dior-medium", [0.5, 2, 8]), ("dior-high", [0.5, 2])],
 )
-def test_the_deltas_of_exposures_make_the_networks_that_restore_runs(
+def test_the_deltas_of_exposures_give_the_networks_that_restore_runs(
     sensor: str, factors: list[float], tmp_path: Path
 ) -> None:
-    """To the byte, applied to the INT8 file of another sensor."""
+    """Each delta gives the same bytes, although it is applied to another sensor's INT8 file."""
     words = f"export --network {SMALL} --out {tmp_path}/x.onnx"
     output = done(f"{words} --sensor {sensor} --delta {tmp_path}/my.delta")
     expected = Network.load(SMALL, sensor=sensor).exposures
@@ -150,9 +148,7 @@ def test_a_damaged_delta_is_named(tmp_path: Path) -> None:
 
 
 def test_the_files_of_exposures_are_refused_before_any_work(tmp_path: Path) -> None:
-    """Where one is an input, another output or cannot be written; and where the sensor does not
-    exist.
-    """
+    """A file is refused that is an input, another output, or a folder. So is an unknown sensor."""
     sensor = own_sensor(tmp_path).rename(tmp_path / "my-x4.toml")
     before = sensor.read_bytes()
     out = tmp_path / "my-x16.onnx"
@@ -179,7 +175,7 @@ def test_a_core_is_written_as_c_for_a_tile(tmp_path: Path) -> None:
 
 
 def test_the_core_of_a_user_s_network_is_written_as_it_is(tmp_path: Path) -> None:
-    """It is of one sensor, so that naming another is refused."""
+    """The network is for one sensor, so another sensor is refused."""
     save_onnx(quantized_half_resolution().host, tmp_path / "own.onnx")
     words = f"export --network {tmp_path}/own.onnx --out {tmp_path}/tile.onnx --tile 32"
     done(f"{words} --c {tmp_path}/net.c")

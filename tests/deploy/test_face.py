@@ -1,4 +1,4 @@
-"""The names of `import beers_deploy`: what they accept and return, and the errors of bad input."""
+"""Tests of the names of `import beers_deploy`: arguments, results, and errors for bad input."""
 
 import copy
 import json
@@ -37,7 +37,7 @@ class Tiny(torch.nn.Module):
             weight.data = 0.1 * torch.randn(weight.shape, generator=generator)
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """The shape is kept."""
+        """Return an image of the same shape."""
         change: torch.Tensor = self.tail(torch.relu(self.head(image)))
         return image + change
 
@@ -105,7 +105,9 @@ def test_a_module_computes_as_in_torch(tiny: bd.Network) -> None:
     assert (tiny.precision, tiny.tiling.halo_px) == ("float32", 2)
 
 
-def test_a_network_is_whatever_holds_one(tiny: bd.Network, tmp_path: Path) -> None:
+def test_a_network_is_loaded_from_a_path_a_model_or_a_network(
+    tiny: bd.Network, tmp_path: Path
+) -> None:
     path = tiny.save(tmp_path / "tiny.onnx")
     for source in (str(path), path, onnx.load(path), tiny):
         network = bd.Network.load(source)
@@ -118,7 +120,9 @@ def test_int8_knows_its_float_network_and_its_layers(tiny: bd.Network, int8: bd.
     assert [row.table for row in int8.layers] == ["integer layers", "integer layers", "rounding"]
 
 
-def test_the_gate_says_which_samples_calibration_saw(int8: bd.Network, samples: np.ndarray) -> None:
+def test_the_gate_notes_the_samples_of_the_calibration(
+    int8: bd.Network, samples: np.ndarray
+) -> None:
     verdict = bd.gate(int8, samples=samples, target="zcu102", limits={"mae": 0.01})
     verdict.raise_if_failed()
     assert "6 of the 8 samples were its calibration" in verdict.notes[0]
@@ -177,7 +181,7 @@ def test_a_table_is_a_document_and_shows_itself(int8: bd.Network, tmp_path: Path
     assert len(repr(table)) < 200
 
 
-def test_a_kit_holds_what_a_board_computes(int8: bd.Network, tmp_path: Path) -> None:
+def test_a_kit_has_the_expected_results_of_its_core(int8: bd.Network, tmp_path: Path) -> None:
     folder = bd.Board.load("zcu102").kit(int8, tmp_path / "kit", tile=32)
     core = bd.Network.load(folder / "core.onnx")
     assert core(np.load(folder / "input.npy")) == pytest.approx(np.load(folder / "expected.npy"))

@@ -1,4 +1,4 @@
-"""The gate catches faults of quantised files, and a CI job can read its verdict."""
+"""Test that the gate finds faults of quantised files, and refuses inputs that do not fit."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -29,7 +29,7 @@ from tests.deploy.command_line import done, refused
 from tests.quant.quick import Calibration, change, changed, drawn
 from tests.shipped import shipped_pair
 
-Spoil = Callable[[onnx.ModelProto], None]
+Corrupt = Callable[[onnx.ModelProto], None]
 
 
 @pytest.fixture(scope="module")
@@ -42,17 +42,19 @@ def unseen() -> Patches:
     return drawn(2, seed=7, scene=77)
 
 
-def failed(
-    reference_model: onnx.ModelProto, unseen: Patches, folder: Path, spoil: Spoil
+def failed_checks(
+    reference_model: onnx.ModelProto, unseen: Patches, folder: Path, corrupt: Corrupt
 ) -> set[str]:
     """Return the names of the checks that a corrupted copy of the shipped file fails."""
     model = onnx.load(shipped_pair("convbeers-xs")[1])
-    spoil(model)
-    save_onnx(model, folder / "spoilt.onnx")
+    corrupt(model)
+    save_onnx(model, folder / "corrupted.onnx")
     result = compare(open_session(reference_model), open_session(model), unseen)
     limits = Limits(std_over_mae=2.5, saturated=0.001)
     checks = judge(result, limits, shares=saturated_shares(model, unseen.degraded))
-    checks += file_checks(reference_model, Network(model, "spoilt"), TargetProfile.load("vck190"))
+    checks += file_checks(
+        reference_model, Network(model, "corrupted"), TargetProfile.load("vck190")
+    )
     return {check.name for check in checks if not check.passed}
 
 
@@ -83,7 +85,7 @@ def give_a_float_scale(model: onnx.ModelProto) -> None:
 
 
 def clip_an_activation(model: onnx.ModelProto) -> None:
-    """A block's inner tensor at a scale four too fine: it saturates."""
+    """Store a block's inner tensor at a scale that is four bits too fine, so that it saturates."""
     conv = node(model, "body.1.first")
     reader = node(model, "body.1.second")
     scale = next(
@@ -107,7 +109,7 @@ def raise_a_floor(model: onnx.ModelProto) -> None:
     )
 
 
-def change_the_host(name: str, value: float) -> Spoil:
+def change_the_host(name: str, value: float) -> Corrupt:
     return lambda model: change(model, name, lambda _: np.array(value))
 
 
@@ -119,18 +121,18 @@ def read_at_another_scale(model: onnx.ModelProto) -> None:
 def test_the_shipped_file_passes(
     reference_model: onnx.ModelProto, unseen: Patches, tmp_path: Path
 ) -> None:
-    assert failed(reference_model, unseen, tmp_path, lambda _: None) == set()
+    assert failed_checks(reference_model, unseen, tmp_path, lambda _: None) == set()
 
 
 @pytest.mark.parametrize(
-    ("spoil", "checks"),
+    ("corrupt", "checks"),
     [
         (drop_a_relu, {"ReLUs lost or added"}),
         (give_a_float_scale, {"faults of the encoding"}),
         (clip_an_activation, {"MAE", "saturated results"}),
         (shift_a_bias, {"MAE"}),
         (swap_the_planes, {"MAE"}),
-        # What hardly shows in pixels is seen in the file.
+        # These faults hardly change pixels, but are found in the file.
         (raise_a_floor, {"ReLUs lost or added", "faults of the encoding"}),
         (read_at_another_scale, {"faults of the encoding"}),
         (change_the_host("gain", 4), {"faults of the encoding"}),
@@ -138,17 +140,17 @@ def test_the_shipped_file_passes(
         (change_the_host("fine_max", 0.25), {"faults of the encoding"}),
     ],
 )
-def test_a_spoilt_file_is_stopped(
-    spoil: Spoil,
+def test_a_corrupted_file_fails(
+    corrupt: Corrupt,
     checks: set[str],
     reference_model: onnx.ModelProto,
     unseen: Patches,
     tmp_path: Path,
 ) -> None:
-    assert checks <= failed(reference_model, unseen, tmp_path, spoil)
+    assert checks <= failed_checks(reference_model, unseen, tmp_path, corrupt)
 
 
-def test_without_8_bit_results_no_limit_on_them_is_kept() -> None:
+def test_without_8_bit_results_a_limit_on_them_fails() -> None:
     result = bd.compare("convbeers-xs", patches=1).result
     unlimited = len(judge(result, Limits(), shares={}))
     *others, check = judge(result, Limits(saturated=0.5), shares={})
@@ -163,7 +165,7 @@ def test_options_that_do_not_go_together_are_refused(tmp_path: Path) -> None:
     assert "'mae_growth' needs a --baseline" in refused(f"gate --limits {tmp_path}/gate.toml")
 
 
-def test_what_is_no_image_is_compared_unclipped_and_other_shapes_are_refused() -> None:
+def test_results_that_are_no_images_are_not_clipped_and_other_shapes_are_refused() -> None:
     def shifted(by: float, channels: int = 1) -> ort.InferenceSession:
         w = GraphWriter()
         weight = w.constant("w", np.ones((channels, 1, 1, 1), np.float32))
@@ -182,10 +184,9 @@ SMALL = "convbeers-xs"
 
 
 def test_a_baseline_shows_a_wrong_bias_in_nearly_any_layer(unseen: Patches) -> None:
-    """A bias off by one scale may hide below a limit on the MAE, seldom in a twentieth of what it
-    was.
+    """A doubled bias may pass a limit on the MAE, but seldom a limit of 5 % over the baseline.
 
-    The two that are left out add nothing but where a copy is rounded.
+    The two biases that are left out only change how a copy is rounded.
     """
     weights, path = shipped_pair(SMALL, BLIND)
     session = open_session(float_model(weights))
@@ -219,9 +220,7 @@ def test_the_constants_of_an_int8_file_may_be_nodes() -> None:
 
 
 def test_results_that_are_never_below_zero_need_no_relu() -> None:
-    """An 8-bit range from zero may be a ReLU folded in, or none: both are told apart by what was
-    there in float.
-    """
+    """An 8-bit range from zero may contain a ReLU or not. The count in float decides."""
     relus = Relus(explicit=1, folded=2)
     assert [relus.off_by(count) for count in range(6)] == [1, 0, 0, 0, 1, 2]
 
@@ -260,7 +259,7 @@ def test_two_networks_of_one_kind_are_refused(
         assert f"must be {expected} network" in refused("gate", *pair)
 
 
-def test_samples_without_references_tell_no_loss_and_cannot_keep_a_limit_on_it(
+def test_samples_without_references_have_no_loss_and_no_limit_on_it(
     tmp_path: Path,
 ) -> None:
     samples = tmp_path / "samples.npy"
@@ -275,7 +274,7 @@ def test_samples_without_references_tell_no_loss_and_cannot_keep_a_limit_on_it(
     assert "--samples must have references for the limit 'psnr_drop_db'" in message
 
 
-def test_a_metric_without_a_limit_is_told_to_be_unjudged(tmp_path: Path) -> None:
+def test_a_metric_without_a_limit_is_noted_as_not_judged(tmp_path: Path) -> None:
     image = np.random.default_rng(0).uniform(0.1, 0.9, (2, 1, 40, 40)).astype(np.float32)
     np.savez(tmp_path / "s.npz", image=image, reference=image)
     limits = tmp_path / "limits.toml"

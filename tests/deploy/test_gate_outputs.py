@@ -1,5 +1,5 @@
-"""The outputs of a gate: no older verdict stays, a CI job reads errors, and digests are those of
-the judged files.
+"""Tests of the outputs of a gate: no older verdict stays, a CI job reads errors, and digests are
+those of the judged files.
 """
 
 import hashlib
@@ -33,7 +33,7 @@ SMALL = "gate convbeers-xs --patches 1"
 
 @pytest.fixture
 def pair(tmp_path: Path) -> tuple[Path, Path]:
-    """A shipped float network and its INT8, as files of the user's own."""
+    """Copy a shipped float network and its INT8 file to files of a user."""
     paths = tmp_path / "float.onnx", tmp_path / "int8.onnx"
     for source, path in zip(shipped_pair("convbeers-xs"), paths, strict=True):
         shutil.copyfile(source, path)
@@ -59,7 +59,7 @@ def test_the_digest_is_that_of_the_bytes_that_were_judged(
     assert json.loads((tmp_path / "r" / "record.json").read_text())["network"]["sha256"] == before
 
 
-def test_a_note_says_if_the_default_limit_does_not_suit(model: Path) -> None:
+def test_a_note_is_added_if_the_default_limit_is_exceeded(model: Path) -> None:
     samples = np.random.default_rng(0).random((6, 1, 32, 40), np.float32)
     verdict = bd.gate(bd.quantize(model, samples=samples), samples=samples)
     (mae,) = (check for check in verdict.checks if check.name == "MAE")
@@ -73,9 +73,7 @@ def test_a_note_says_if_the_default_limit_does_not_suit(model: Path) -> None:
 def test_claims_of_weights_are_verified(
     claim: str, pair: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    """Licence and training are those of shipped weights: a file that only
-    claims them has neither.
-    """
+    """Licence and training belong to shipped weights. A file that only claims them has neither."""
     sensor = Sensor.load("pleiades-degraded")
     int8 = Network.load(pair[1])
     digest = metadata(int8.model)[WEIGHTS]

@@ -1,5 +1,5 @@
-"""Text of others' files in every kind of output: it is shown, on its line, and neither obeyed nor
-taken for markup.
+"""Test that every kind of output shows text of others' files on its line, and neither obeys it nor
+reads it as markup.
 
 The files are networks (metadata, names of nodes and tensors), images and samples (names), sensors
 and boards.
@@ -45,7 +45,7 @@ TEXT = st.text(alphabet=st.characters(exclude_categories=["Cs"]))
 
 
 def any_text(test: Callable[[str], None]) -> Callable[[], None]:
-    """Run a test on any text, and on one that holds every trick."""
+    """Run a test on any text, and on one with every trick."""
     return settings(max_examples=40)(given(TEXT)(example(HOSTILE)(test)))
 
 
@@ -67,18 +67,18 @@ TABLES = {
     "b",
 }
 TAGS = HEAD | TABLES
-"""That a page of ours has without a picture."""
+"""The tags of a page of ours without a picture."""
 
 
 def rows_with(text: str) -> list[Row]:
-    """Rows that have a text wherever a row may have one."""
+    """Return rows that have `text` wherever a row may have a text."""
     figure = measured(1.5, text, text)
     return [
         Row("t", text, {"size": figure, text: unavailable("px", text)}, {text: text, "word": text})
     ]
 
 
-def shown_alike(text: str, allowed: str = "\n\t\N{NO-BREAK SPACE}") -> bool:
+def all_printable(text: str, allowed: str = "\n\t\N{NO-BREAK SPACE}") -> bool:
     return all(letter.isprintable() or letter in allowed for letter in text)
 
 
@@ -107,7 +107,7 @@ def test_a_page_has_the_text_and_no_tag_of_it(text: str) -> None:
     html = render(
         Report(text, text, [Section(text, rows_with(text), text)], [picture], [text], sorts=True)
     )
-    assert shown_alike(html)
+    assert all_printable(html)
     parsed = Tags(html)
     assert parsed.tags <= TAGS | {"figure", "img", "figcaption"}
     assert "onerror" not in parsed.attributes
@@ -117,7 +117,7 @@ def test_a_page_has_the_text_and_no_tag_of_it(text: str) -> None:
 @any_text
 def test_a_notebook_has_the_text_and_no_tag_of_it(text: str) -> None:
     table = Table("check", {}, (), tuple(rows_with(text)), notes=(text,))
-    assert shown_alike(table._repr_html_())
+    assert all_printable(table._repr_html_())
     assert Tags(table._repr_html_()).tags <= TAGS
     assert repr(table).isprintable()
 
@@ -130,7 +130,7 @@ def test_a_terminal_has_each_line_of_ours_and_no_other(text: str) -> None:
         row = Row("t", "one", {"size": measured(1.5, "px", "here")}, {"word": words[:20]})
         print_rows(f"t{words[:20]}", [row] * 2, Console(file=stream, width=PIPE_WIDTH))
         outputs.append(stream.getvalue())
-    assert shown_alike(outputs[0], "\n")
+    assert all_printable(outputs[0], "\n")
     assert outputs[0].count("\n") == outputs[1].count("\n")
 
 
@@ -155,18 +155,18 @@ def test_progress_is_one_line_without_markup(text: str) -> None:
             progress.step(text)
     lines = stream.getvalue().split("\n")
     assert len(lines) == 3
-    assert shown_alike("".join(lines), "")
+    assert all_printable("".join(lines), "")
     terminal = io.StringIO()
     bar_on_terminal = progress._new_bar()
     bar_on_terminal.add_task(one_line(text), total=1)
     Console(file=terminal, width=10_000).print(
         bar_on_terminal.make_tasks_table(bar_on_terminal.tasks)
     )
-    # rich leaves out what no terminal shows by itself, such as a modifier of an emoji.
+    # rich omits characters that no terminal shows alone, such as a modifier of an emoji.
     plain_text = io.StringIO()
     Console(file=plain_text, width=10_000).print(Text(one_line(text)), end="")
     shown = plain_text.getvalue().rstrip("\n")
-    # A modifier alone takes no place, and a table leaves it out.
+    # A modifier alone has no width, and a table omits it.
     is_shown = cell_len(shown) > 0
     assert not is_shown or terminal.getvalue().startswith(shown), "a name in brackets is no markup"
 
@@ -178,12 +178,12 @@ def test_a_cell_of_markdown_is_one_cell_of_plain_text(text: str) -> None:
     assert html.count("<tr>") == 2
     assert html.count("<td>") == 3
     assert Tags(html).tags == {"table", "thead", "tbody", "tr", "th", "td"}
-    assert shown_alike("\n".join(lines), "\n")
+    assert all_printable("\n".join(lines), "\n")
     assert "\n" not in markdown_text(text)
 
 
 def document(text: str) -> tuple[Table, dict[str, Any]]:
-    """A judged table, and what a record says of its network."""
+    """Return a judged table and the record of its network."""
     check = Check("MAE", 2.0, 1.0, "dB", detail=text)
     table = Table("gate", {}, (Input(text, "0" * 64),), tuple(rows_with(text)), (check,), (text,))
     network = {"name": text, "precision": "INT8", "sha256": "0" * 64}
@@ -203,7 +203,7 @@ def document(text: str) -> tuple[Table, dict[str, Any]]:
 def test_a_record_has_the_text_of_a_network_s_metadata_escaped(text: str) -> None:
     table, record = document(text)
     html = render(_page(table, record))
-    assert shown_alike(html)
+    assert all_printable(html)
     assert Tags(html).tags <= TAGS
 
 
@@ -212,7 +212,7 @@ def test_a_bill_of_materials_has_names_on_one_line(text: str) -> None:
     pytest.importorskip("cyclonedx")
     _, record = document(text)
     bill = bill_of(record)
-    assert shown_alike(bill, "\n")
+    assert all_printable(bill, "\n")
     content = json.loads(bill)
     component = content["metadata"]["component"]
     assert component["name"] == one_line(text)
@@ -226,14 +226,14 @@ def test_a_drawing_has_the_text_as_words(text: str) -> None:
     with look():
         figure = new_figure(100, 100)
         svg = svg_of(figure, text)
-    assert shown_alike(svg)
+    assert all_printable(svg)
     root = ET.fromstring(svg)  # noqa: S314 - our own
     kinds = {element.tag.rpartition("}")[2] for element in root.iter()}
     assert not kinds & {"img", "script", "foreignObject"}
 
 
 def test_no_output_is_written_past_the_functions_that_escape() -> None:
-    """Words of a file reach a terminal through few modules; each place was reviewed once."""
+    """Only these modules write to a terminal, and each was reviewed once."""
     folder = Path(__file__).parents[2]
     printing = re.compile(
         r"typer\.echo\(|\bconsole\.print\(|std(out|err)\.write\(|(?<![.\w>])print\("

@@ -1,4 +1,4 @@
-"""A network of colours and a map of noise levels, as FFDNet reads them: from samples to a board."""
+"""Tests of a network that reads colours and a map of noise levels, as FFDNet does."""
 
 from pathlib import Path
 from typing import Any, cast
@@ -105,8 +105,8 @@ def test_the_file_reads_the_networks_own_units(tmp_path: Path) -> None:
 
 
 def test_restore_maps_full_scale_onto_a_stated_range() -> None:
-    """`restore` maps pixels to the stated range and back, and refuses a range that samples alone
-    tell.
+    """`restore` maps pixels to the stated range and back, and refuses a range that was only
+    found in samples.
 
     The largest sample is no full scale, so such a range says nothing about other images.
     """
@@ -130,8 +130,8 @@ def test_restore_maps_full_scale_onto_a_stated_range() -> None:
 def test_image_files_are_samples_of_a_stated_range(tmp_path: Path) -> None:
     """`quantize` and `gate` map full scale of image files onto a stated range, as `restore` does.
 
-    So they find what they find in the same values as arrays. A range that samples alone tell says
-    nothing about full scale, so that `gate` refuses image files for it.
+    So their results are those of the same values as arrays. A range that was only found in samples
+    states nothing about full scale, so `gate` refuses image files for it.
     """
     convolution = nn.Conv2d(3, 3, 3, padding=1)
     with torch.no_grad():

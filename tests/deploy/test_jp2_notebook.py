@@ -1,4 +1,4 @@
-"""The cells of docs/tutorials/jp2-to-cog.ipynb run, and print the outputs that are stored in it."""
+"""Test that the cells of docs/tutorials/jp2-to-cog.ipynb run and print their stored outputs."""
 
 import contextlib
 import io
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.slow
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "tutorials" / "jp2-to-cog.ipynb"
 CELLS: list[dict[str, Any]] = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
 MOST_BYTES = 100_000
-"""Size of the whole notebook with its picture: a clone has every version of it."""
+"""Largest size of the notebook with its picture, because a clone has every version of it."""
 
 
 def run_cell(source: str, names: dict[str, Any]) -> str:

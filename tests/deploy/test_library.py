@@ -1,4 +1,4 @@
-"""An array is restored to the pixels that `restore` writes of the same image in a file."""
+"""Test that arrays of NumPy, Dask and xarray are restored alike, and which arrays are refused."""
 
 from pathlib import Path
 from typing import Any
@@ -86,7 +86,7 @@ def test_a_dask_array_has_the_full_scale_of_its_sensor(da: Any, model: Path) -> 
     assert_array_equal(lazy.compute(), restore(pixels, **options))
 
 
-def test_openvino_serves_dask_s_threads(da: Any, model: Path) -> None:
+def test_openvino_runs_in_dasks_threads(da: Any, model: Path) -> None:
     pytest.importorskip("openvino")
     pixels = noise(150, 120)
     lazy = restore(da.from_array(pixels, chunks=64), network=model, tile=40, runtime="openvino")

@@ -1,4 +1,4 @@
-"""A fault of an installed library ends with 70 and the library's name, not as a damaged file."""
+"""Test that a fault of an installed library is not reported as a damaged file."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -69,7 +69,7 @@ def test_a_fault_of_this_program_names_no_library() -> None:
 def test_a_run_of_onnxruntime_that_fails_is_no_fault_of_the_file(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Also where the processor is asked how it adds, with a network of this program."""
+    """This holds also for the small network that tests how the processor adds."""
 
     def moved(*_: object, **__: object) -> None:
         raise AttributeError("moved")

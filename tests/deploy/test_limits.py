@@ -1,6 +1,4 @@
-"""What is asked of a machine has an end: said before any work, not after minutes of silence or at
-the last byte.
-"""
+"""Test that numbers beyond their limits are refused before any work."""
 
 import os
 from collections.abc import Iterator
@@ -41,7 +39,7 @@ def test_threads_and_processes_are_at_most_the_cores(
         "simulate --out pairs --workers",
     ],
 )
-def test_a_command_says_how_many(
+def test_a_command_names_the_number_of_cores(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""Shipped networks by name, conditioned on any sensor, in float32 and in INT8."""
+"""Tests of shipped networks by name, conditioned on any sensor, in float32 and in INT8."""
 
 import logging
 from collections import Counter
@@ -41,7 +41,7 @@ KNOWN = Sensor.load(SENSOR)
 def test_the_same_numbers_are_the_same_sensor_and_others_are_not(
     conditioned: Path, tmp_path: Path
 ) -> None:
-    """Sources and descriptions change no network; a number does, under the same name of a file."""
+    """Sources and descriptions change no network. A number does, though the files have one name."""
     networks = []
     for folder, old, new in (
         ("a", "", ""),
@@ -89,7 +89,7 @@ def test_only_quantize_calibrates_weights_of_users(conditioned: Path) -> None:
 
 @pytest.mark.parametrize("name", shipped_names())
 def test_the_shipped_int8_files_are_of_these_weights(name: str) -> None:
-    """Other weights need other files, which docs/make/int8.py makes."""
+    """Other weights need other files, which docs/make/int8.py writes."""
     header = metadata(load_onnx(SHIPPED / f"{name}{INT8}.onnx"))
     assert header[WEIGHTS] == sha256(shipped_weights(name))
     assert header["variant"] == name
@@ -129,7 +129,7 @@ def test_a_value_outside_the_training_is_reported_each_time(
         assert message.startswith(sentence)
 
 
-def test_a_network_that_is_made_for_one_sensor_refuses_a_sensor_for_each_band(
+def test_a_network_for_one_sensor_refuses_a_sensor_for_each_band(
     tmp_path: Path,
 ) -> None:
     bands = np.full((2, 20, 30), 900, np.uint16)
@@ -219,7 +219,7 @@ def test_a_run_parses_and_opens_a_network_once(
     counted("onnxruntime", "InferenceSession")
     pixels = np.random.default_rng(0).integers(0, 4096, (61, 83)).astype(np.uint16)
     tifffile.imwrite(tmp_path / "in.tif", pixels)
-    # The processor is asked once how it adds, with a network of its own.
+    # How the processor adds is tested once a process, with another network.
     if as_array:
         bd.restore(pixels, network=model, tile=23)
     else:
@@ -230,9 +230,7 @@ def test_a_run_parses_and_opens_a_network_once(
 def test_an_int8_file_for_every_sensor_restores_and_is_judged_as_the_shipped_name(
     tmp_path: Path,
 ) -> None:
-    """A recipe's INT8 file is given by its path, and must not restore for the middle of the range
-    of sensors.
-    """
+    """A recipe's INT8 file is named by its path, and must not restore for the middle sensor."""
     sensor = "dior-medium"
     copy = tmp_path / "int8.onnx"
     copy.write_bytes((SHIPPED / "convbeers-xs-int8.onnx").read_bytes())
@@ -248,7 +246,7 @@ def test_an_int8_file_for_every_sensor_restores_and_is_judged_as_the_shipped_nam
     pair = bd.gate("convbeers-xs", sensor=sensor, patches=4)
     assert "INT8 against float" in [row.name for row in pair.rows]
     assert [row.figures for row in files.rows] == [row.figures for row in pair.rows]
-    # Two networks of an unknown sensor stay that.
+    # Two networks that were loaded without a sensor are not conditioned on the given one.
     unknown = bd.gate(
         Network.load("convbeers-xs"), Network.load("convbeers-xs-int8"), sensor=sensor, patches=4
     )

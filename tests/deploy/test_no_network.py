@@ -1,7 +1,7 @@
-"""The main commands where no socket can be opened: nothing is fetched, asked or told at run time.
+"""Test that the main commands send and fetch nothing: they run where no socket can be opened.
 
-Most run in this process, where Python's sockets are watched; some in a process of their own, where
-the kernel watches native libraries' too (tests/deploy/sealed.py).
+Most run in this process, where Python's sockets are replaced. Some run in a process of their own,
+where the kernel also stops sockets of native libraries (tests/deploy/sealed.py).
 """
 
 import json
@@ -35,7 +35,7 @@ needs_filters = pytest.mark.skipif(
 
 @pytest.fixture
 def no_sockets(monkeypatch: pytest.MonkeyPatch) -> list[tuple[object, ...]]:
-    """Every attempt raises, and is counted: a library might swallow the error."""
+    """Let every attempt raise, and collect the attempts: a library might catch the error."""
     attempts: list[tuple[object, ...]] = []
 
     def refuse(*arguments: object, **_: object) -> None:
@@ -84,9 +84,7 @@ def test_the_chain_opens_no_socket(
 
 
 def alone(home: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
-    """Python where a user would start it: no variable is set that makes libraries hold their
-    tongues in CI.
-    """
+    """Run Python as a user would, without the variables that turn off telemetry in CI."""
     inherited = {name: os.environ[name] for name in ("PATH", "SYSTEMROOT") if name in os.environ}
     environment = {**inherited, "HOME": str(home), "TMPDIR": str(home)}
     command = [sys.executable, *map(str, arguments)]
@@ -101,7 +99,9 @@ def files_below(home: Path) -> list[str]:
 
 @needs_filters
 @pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
-def test_no_native_library_opens_one_or_keeps_an_identifier(tmp_path: Path, runtime: str) -> None:
+def test_no_native_library_opens_a_socket_or_stores_an_identifier(
+    tmp_path: Path, runtime: str
+) -> None:
     if runtime == "openvino":
         pytest.importorskip("openvino", reason="the extra 'openvino' is not installed")
     home = tmp_path / "home"

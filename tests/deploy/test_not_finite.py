@@ -1,4 +1,4 @@
-"""A network with weights that are not finite, or whose results are NaN, leads to one sentence."""
+"""Test that a network with weights or results that are not finite leads to one sentence."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -40,16 +40,16 @@ OF_WEIGHTS = [
     "quantize {0} --out {1}/int8.onnx",
     f"gate {{0}} {INT8} --json {{1}}/g.json",
 ]
-Spoil = Callable[[ConvBEERS], None]
+Corrupt = Callable[[ConvBEERS], None]
 
 
-def one(value: float) -> Spoil:
-    """Return what sets one weight of the body to a value."""
+def one(value: float) -> Corrupt:
+    """Return a function that sets one weight of the body to `value`."""
 
-    def spoil(network: ConvBEERS) -> None:
+    def corrupt(network: ConvBEERS) -> None:
         dict(network.named_parameters())["body.1.first.weight"].view(-1)[5] = value
 
-    return spoil
+    return corrupt
 
 
 def overflowing(network: ConvBEERS) -> None:
@@ -59,11 +59,11 @@ def overflowing(network: ConvBEERS) -> None:
             weight.fill_(1e30)
 
 
-def written(folder: Path, spoil: Spoil, suffix: str) -> Path:
+def write_network(folder: Path, corrupt: Corrupt, suffix: str) -> Path:
     path = folder / f"net{suffix}"
     network = ConvBEERS(VARIANTS[VARIANT]).eval()
     with torch.no_grad():
-        spoil(network)
+        corrupt(network)
     if suffix == ".onnx":
         save_onnx(to_onnx(network, {}), path)
     else:
@@ -72,8 +72,8 @@ def written(folder: Path, spoil: Spoil, suffix: str) -> Path:
     return path
 
 
-def spoken(command: str, path: Path, exit_code: int = 2) -> str:
-    """Run a command on a network, and return its output; the command leaves no file behind."""
+def output_of(command: str, path: Path, exit_code: int = 2) -> str:
+    """Run a command on a network, check that it leaves no file behind, and return its output."""
     before = {p for p in path.parent.rglob("*") if p.is_file()}
     output = done(*command.format(path, path.parent).split(), code=exit_code)
     assert {p for p in path.parent.rglob("*") if p.is_file()} == before
@@ -85,19 +85,19 @@ def test_a_file_with_such_a_weight_is_not_read(tmp_path: Path, value: float) -> 
     with pytest.raises(
         ModelError, match=r"must be finite, but body\.1\.first\.weight has 1 NaN or infinite"
     ):
-        load_onnx(written(tmp_path, one(value), ".onnx"), to_run=False)
+        load_onnx(write_network(tmp_path, one(value), ".onnx"), to_run=False)
 
 
 @pytest.mark.parametrize("command", READERS)
 def test_no_command_accepts_such_a_network(tmp_path: Path, command: str) -> None:
-    path = written(tmp_path, one(np.nan), ".onnx")
-    assert "must be finite, but body.1.first.weight has 1 NaN" in spoken(command, path)
+    path = write_network(tmp_path, one(np.nan), ".onnx")
+    assert "must be finite, but body.1.first.weight has 1 NaN" in output_of(command, path)
 
 
 @pytest.mark.parametrize("command", OF_WEIGHTS)
 def test_no_command_accepts_such_weights(tmp_path: Path, command: str) -> None:
-    path = written(tmp_path, one(np.inf), ".safetensors")
-    assert "its weights are not finite" in spoken(command, path)
+    path = write_network(tmp_path, one(np.inf), ".safetensors")
+    assert "its weights are not finite" in output_of(command, path)
 
 
 @pytest.mark.parametrize(
@@ -111,14 +111,16 @@ def test_no_command_accepts_such_weights(tmp_path: Path, command: str) -> None:
 def test_a_network_whose_sums_overflow_is_refused_where_it_runs(
     tmp_path: Path, command: str, scenes: Path
 ) -> None:
-    message = spoken(command.replace("{2}", str(scenes)), written(tmp_path, overflowing, ".onnx"))
+    message = output_of(
+        command.replace("{2}", str(scenes)), write_network(tmp_path, overflowing, ".onnx")
+    )
     assert "NaN or infinit" in message
 
 
 def test_the_gate_fails_a_network_whose_sums_overflow(tmp_path: Path, scenes: Path) -> None:
-    output = spoken(
+    output = output_of(
         f"gate {{0}} {INT8} --images {scenes} --patches 1",
-        written(tmp_path, overflowing, ".onnx"),
+        write_network(tmp_path, overflowing, ".onnx"),
         exit_code=1,
     )
     assert "gate FAILED" in output
@@ -126,7 +128,7 @@ def test_the_gate_fails_a_network_whose_sums_overflow(tmp_path: Path, scenes: Pa
 
 
 def test_the_gate_does_not_take_an_infinite_pixel_for_full_scale() -> None:
-    """If it were clipped to 1, infinity on both sides would agree."""
+    """If both sides were clipped to 1, infinity in both networks would agree."""
     ends = [
         helper.make_tensor_value_info(name, 1, ["N", 1, "H", "W"]) for name in ("image", "restored")
     ]

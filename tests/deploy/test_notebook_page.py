@@ -1,4 +1,4 @@
-"""The code of docs/how-to/notebook.md runs, and gives what the command gives."""
+"""Test that the code of docs/how-to/notebook.md runs and gives the results of the command."""
 
 import re
 import shutil
@@ -34,7 +34,7 @@ class Net(torch.nn.Module):
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "notebook.md"
 
 
-# The warning is between rioxarray and affine.
+# The warning comes from the use of affine by rioxarray.
 @pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")
 def test_the_page_gives_what_the_command_gives(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

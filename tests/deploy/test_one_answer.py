@@ -1,4 +1,4 @@
-"""What check passes, quantize accepts, gate judges, bench predicts and restore runs."""
+"""Test that check, quantize, gate, bench and restore agree on which networks they accept."""
 
 import logging
 from collections.abc import Callable
@@ -183,7 +183,7 @@ def test_commands_do_not_contradict_each_other(
             )
     except ModelError:
         int8 = None
-    # What a board does not run, such as an activation behind a resize, may have integers.
+    # A network that a board does not run may be quantised: an activation behind a resize, for one.
     assert fits == (int8 is not None and bool(bd.check(int8, tile=64)))
     if not fits:
         return
@@ -211,7 +211,7 @@ def fixed(path: Path, side_px: int) -> Path:
 
 
 def test_unpadded_networks_of_a_fixed_size_get_one_answer(tmp_path: Path) -> None:
-    """Every command takes a network without padding at a fixed size as it takes it at any."""
+    """Every command accepts a network without padding at a fixed size, as it does at any size."""
     path = drawn(
         tmp_path / "a.onnx", ["relu", "valid"], adds_image=False, clips=False, padded=False
     )
@@ -270,7 +270,7 @@ def test_an_input_that_is_no_image_has_one_remedy(
             command()
 
 
-def test_quantize_says_what_restore_refuses(tmp_path: Path) -> None:
+def test_quantize_notes_that_restore_refuses_the_network(tmp_path: Path) -> None:
     """A network that pools over its whole image has integers, and no tiles of a larger image."""
     w = Drawn(1)
     first = w.conv("image", CHANNELS, 1)
@@ -293,7 +293,7 @@ def test_quantize_says_what_restore_refuses(tmp_path: Path) -> None:
 def test_quantize_warns_of_what_the_board_refuses(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Other hardware may run it, so that it is written, but nobody finds out on the board."""
+    """The file is written, because other hardware may run it, but the user is warned."""
     w = Drawn(1)
     first, second = (w.conv("image", CHANNELS, 1) for _ in range(2))
     leaky = w.add("LeakyRelu", w.add("Add", first, second), alpha=26 / 256)
@@ -312,8 +312,8 @@ def test_quantize_warns_of_what_the_board_refuses(
 
 
 @pytest.mark.parametrize("kind", ["Add", "Mul", "Concat", "AveragePool"])
-def test_what_adapt_replaces_fits_behind_any_operation(kind: str, tmp_path: Path) -> None:
-    """`check` advises `--adapt`, so that its result must pass."""
+def test_a_network_after_adapt_passes_behind_any_operation(kind: str, tmp_path: Path) -> None:
+    """`check` advises `--adapt`, so the result of `--adapt` must pass."""
     w = Drawn(1)
     feeds = [w.conv("image", CHANNELS, 1) for _ in range(2)]
     attributes: dict[str, Any] = {"axis": 1} if kind == "Concat" else {}

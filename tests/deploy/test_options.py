@@ -1,4 +1,4 @@
-"""Every option of every verb is described, and refused where it would have no effect."""
+"""Test that every option of every verb is described, and refused where it has no effect."""
 
 import re
 import warnings
@@ -22,9 +22,9 @@ class Refused:
     """Options that one command refuses together.
 
     Attributes:
-        options: each of these parameters,
-        beside: where these words stand on the command line; words in capitals are files,
-        without: or where this option is not given.
+        options: the parameters, each of which is refused.
+        beside: other words on the command line; words in capitals are files.
+        without: the option without which they are refused.
     """
 
     options: tuple[str, ...]
@@ -130,7 +130,7 @@ def refused_options() -> Iterator[tuple[str, str, Refused]]:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_parameter_is_described_once_and_in_order(name: str) -> None:
-    """The docstring is the only text about an option: help and reference are made from it."""
+    """The docstring is the only text about an option: help and reference are built from it."""
     command = COMMANDS[name]
     described = [entry.arg_name for entry in command.doc.params]
     own = list(options(name))

@@ -1,4 +1,4 @@
-"""A network of several outputs, of which one is kept."""
+"""Tests of a network of several outputs, of which a user names one."""
 
 from pathlib import Path
 
@@ -36,14 +36,14 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
     parts=st.lists(st.sampled_from(PARTS), max_size=3),
     adds_image=st.booleans(),
 )
-def test_what_is_kept_computes_the_same(
+def test_a_network_with_one_output_computes_the_same(
     tmp_path_factory: pytest.TempPathFactory,
     output: str,
     sides: tuple[int, int],
     parts: list[str],
     adds_image: bool,
 ) -> None:
-    """The network with one output kept gives what the whole network gives there.
+    """The network with one output returns what the whole network returns there.
 
     It has fewer nodes, because a board should not compute the output that nobody reads.
     """
@@ -92,7 +92,7 @@ def test_an_output_must_be_named(network: Path, tmp_path: Path) -> None:
         bd.gate(network, int8, samples=SAMPLES, progress=False)
     with pytest.raises(OptionError, match=r"must be an output of .*restored, large, got 'x'"):
         bd.check(network, output="x")
-    # Of another output than that of the INT8 file the results have another size.
+    # The results of the other output have another size than those of the INT8 file.
     with pytest.raises(BeersError, match="made from this float network"):
         bd.gate(network, int8, samples=SAMPLES, output="restored", progress=False)
     samples_path = tmp_path / "x.npy"

@@ -1,7 +1,7 @@
-"""One rule for every output of every command: no input, no other output, nothing but a regular file
-or a new name.
+"""Test one rule for every output of every command: it is no input, no other output, and either a
+regular file or a new name.
 
-The annotation of a parameter says whether its path is read or written, and what a folder holds.
+The annotation of a parameter states whether its path is read or written, and the files of a folder.
 """
 
 import os
@@ -20,26 +20,26 @@ from tests.deploy.verb_parameters import options
 
 JSON = "json"
 SUFFIX = ".onnx"
-"""Of every name: some commands ask for it."""
+"""The suffix of every name, because some commands need it."""
 MORE = {
     "stress": ("--bit-flips",),
     "tradeoff": ("--network", "convbeers-xs"),
     "simulate": ("--with", "haze"),
 }
-"""Without which a command does not write, or computes for seconds before it checks its images."""
+"""Options without which a command writes nothing, or computes for seconds before it checks."""
 BESIDE = {
     ("restore", "sensor"): ("--method", "traditional"),
     ("train", "rounding"): ("--conditioned", "--start", "convbeers-xs"),
     ("evaluate", "labels"): ["--images", "pictures", "--detector", "detector.onnx"],
     ("golden", "network"): (),
 }
-"""What an option is refused without."""
+"""The options that an option needs."""
 TOGETHER_REFUSED = {("golden", "compare"), ("export", "apply")}
-"""Inputs that no output goes with."""
+"""Inputs that are refused with any output."""
 
 
-def written(name: str) -> dict[str, str]:
-    """The outputs of a command; of a folder the first file that it holds, of a file nothing."""
+def outputs_of(name: str) -> dict[str, str]:
+    """Return the outputs of a command: for a folder its first file, for a file an empty text."""
     outputs = {}
     for option in options(name).values():
         if option.written is not None:
@@ -49,24 +49,24 @@ def written(name: str) -> dict[str, str]:
     return outputs
 
 
-def read(name: str) -> list[str]:
-    """The inputs of a command."""
+def inputs_of(name: str) -> list[str]:
+    """Return the names of the inputs of a command."""
     return [option.name for option in options(name).values() if option.is_input]
 
 
-WRITERS = list(chain.from_iterable(product([name], written(name)) for name in COMMANDS))
+WRITERS = list(chain.from_iterable(product([name], outputs_of(name)) for name in COMMANDS))
 TELLS_CI = ("gate", "junit")
-"""What is written where nothing could be judged, too: a CI job then shows why."""
-FILES = [(name, output) for name, output in WRITERS if not written(name)[output]]
+"""An output that is also written after an error, so that a CI job shows the reason."""
+FILES = [(name, output) for name, output in WRITERS if not outputs_of(name)[output]]
 FOLDERS = [pair for pair in WRITERS if pair not in FILES]
 
 
 def in_turn(cases: Iterable[tuple[str, ...]], ways: Iterable[object]) -> list[tuple[object, ...]]:
-    """Each case one way, each way in its turn: one function checks the outputs of all commands."""
+    """Give each case one of the ways in turn: one function checks the outputs of all commands."""
     return [(*case, way) for case, way in zip(cases, cycle(ways), strict=False)]
 
 
-def test_every_folder_says_what_it_holds() -> None:
+def test_every_output_folder_declares_its_files() -> None:
     for name in COMMANDS:
         for option in options(name).values():
             if option.written is not None and option.written.folder:
@@ -74,7 +74,7 @@ def test_every_folder_says_what_it_holds() -> None:
 
 
 def arguments(name: str, values: dict[str, Path]) -> list[str]:
-    """The command with these values."""
+    """Return the words of a command with these values."""
     words = [name, *MORE.get(name, ())]
     for key, value in values.items():
         if key == JSON:
@@ -86,8 +86,8 @@ def arguments(name: str, values: dict[str, Path]) -> list[str]:
 
 
 def command_with(command: str, folder: Path, /, **values: Path) -> list[str]:
-    """As `arguments`: an input for each argument, an output for each that must be given, unless
-    stated otherwise.
+    """Return the words of a command with `values`, and with the other inputs and outputs that
+    it needs.
     """
     all_values: dict[str, Path] = {}
     for key, option in options(command).items():
@@ -107,13 +107,13 @@ def existing(path: Path) -> Path:
 
 
 def output_at(name: str, option: str, folder: Path) -> tuple[Path, Path]:
-    """An option's value, and the file that the command will write for it."""
+    """Return a value for an option, and the file that the command will write for it."""
     path = folder / f"place-{option}{SUFFIX}"
-    return path, path / written(name)[option] if written(name)[option] else path
+    return path, path / outputs_of(name)[option] if outputs_of(name)[option] else path
 
 
 def state(folder: Path) -> dict[str, bytes | str]:
-    """Every entry: bytes of files, kinds of others."""
+    """Return every entry of a folder: the bytes of a file, the kind of anything else."""
     entries: dict[str, bytes | str] = {}
     for path in sorted(folder.rglob("*")):
         mode = path.lstat().st_mode
@@ -195,14 +195,14 @@ def test_an_output_folder_is_a_folder(
 @pytest.mark.parametrize(
     ("name", "option"), [pair for pair in WRITERS if pair != TELLS_CI], ids=str
 )
-def test_what_is_refused_for_its_input_leaves_no_new_folder(
+def test_a_command_refused_for_its_input_leaves_no_new_folder(
     name: str, option: str, tmp_path: Path
 ) -> None:
     source = existing(tmp_path / f"source{SUFFIX}")
     value, _ = output_at(name, option, tmp_path / "new" / "below")
     values = {option: value}
     if name != "golden":
-        values |= dict.fromkeys(read(name)[:1], source)
+        values |= dict.fromkeys(inputs_of(name)[:1], source)
     command = command_with(name, tmp_path, **values)
     before = state(tmp_path)
     assert CliRunner().invoke(app, command).exit_code == 2, command
@@ -211,7 +211,7 @@ def test_what_is_refused_for_its_input_leaves_no_new_folder(
 
 def inputs_met() -> Iterator[tuple[str, str, str]]:
     for name, option in WRITERS:
-        for source in read(name):
+        for source in inputs_of(name):
             if (name, source) not in TOGETHER_REFUSED:
                 yield name, option, source
 
@@ -252,7 +252,7 @@ def test_no_output_is_a_file_of_an_input_folder(
     refused(command, tmp_path, str(scene), "an input of this run")
 
 
-def test_figures_of_an_earlier_run_beside_the_images_are_renewed(tmp_path: Path) -> None:
+def test_figures_of_an_earlier_run_next_to_the_images_are_replaced(tmp_path: Path) -> None:
     """The rule does not stop a job that is run twice: it gets as far as reading the images."""
     existing(tmp_path / "scenes" / "scene.png")
     figures = Table(command="evaluate").save(tmp_path / "scenes" / "figures.json")
@@ -262,7 +262,7 @@ def test_figures_of_an_earlier_run_beside_the_images_are_renewed(tmp_path: Path)
 
 
 @pytest.mark.parametrize("command", ["evaluate", "simulate"])
-def test_pictures_do_not_go_where_images_are_read(command: str, tmp_path: Path) -> None:
+def test_an_output_folder_is_no_folder_of_an_input(command: str, tmp_path: Path) -> None:
     scene = existing(tmp_path / "scenes" / "degraded" / "scene.tif")
     arguments_of = {
         "evaluate": f"--images {scene.parent} --out {scene.parent}".split(),
@@ -274,7 +274,7 @@ def test_pictures_do_not_go_where_images_are_read(command: str, tmp_path: Path) 
 def pairs_of_outputs() -> Iterator[tuple[str, str, str]]:
     """Yield every command with each two of its outputs."""
     for name in COMMANDS:
-        for one, other in combinations(written(name), 2):
+        for one, other in combinations(outputs_of(name), 2):
             yield name, one, other
 
 

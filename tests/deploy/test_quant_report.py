@@ -1,4 +1,4 @@
-"""The report of `quantize`: its integer layers, and where INT8 errs."""
+"""Tests of the report of `quantize`: its integer layers, and where INT8 differs most."""
 
 import base64
 import json
@@ -30,7 +30,7 @@ from tests.deploy.report.svg import style_of, text_width
 from tests.model.networks import plain
 
 PHONE_PX = 358
-"""A window of 390 pixels less the page's margins."""
+"""The width of a window of 390 pixels without the page's margins."""
 
 
 def float_file(path: Path) -> str:
@@ -50,7 +50,7 @@ def test_steps_of_fine_tuning_are_whole_or_auto(text: str) -> None:
 
 
 def test_the_patch_of_a_network_that_enlarges_is_shown_at_the_result_s_size() -> None:
-    """The picture stands the patch next to both results, which may have more pixels than it."""
+    """The picture shows the patch next to both results, which may have more pixels."""
     image = np.random.default_rng(0).random((1, 1, 9, 7), np.float32)
     graph = onnx.parser.parse_graph(
         "enlarge (float[1, 1, H, W] x) => (float[1, 1, H2, W2] y) <float[4] s = {1, 1, 2, 2}> "
@@ -150,9 +150,7 @@ def test_the_histogram_is_a_picture_for_light_and_dark() -> None:
 
 @pytest.mark.parametrize("farthest", [1, 40, 137, 4095])
 def test_labels_of_the_histogram_can_be_read_on_the_narrowest_page(farthest: int) -> None:
-    """At the size at which they are written: nothing is scaled down to fit, none is cut, none hides
-    another.
-    """
+    """The picture is not scaled down to fit, and no label is cut or hides another."""
     dn = np.array([0] * 3_000_000 + [-farthest, farthest])
     url = histogram_url(spread(dn))
     root = ET.fromstring(base64.b64decode(url.removeprefix("data:image/svg+xml;base64,")))  # noqa: S314
@@ -177,9 +175,7 @@ def test_labels_of_the_histogram_can_be_read_on_the_narrowest_page(farthest: int
 
 
 def test_a_report_on_samples_shows_the_worst_of_them(tmp_path: Path) -> None:
-    """A report on a user's own samples names them, and speaks of no PSNR if they have no
-    references.
-    """
+    """A report on a user's samples names them, and has no PSNR if they have no references."""
     float_file(tmp_path / "f.onnx")
     np.save(tmp_path / "s.npy", np.random.default_rng(0).random((8, 1, 40, 48), np.float32))
     options = f"--samples {tmp_path}/s.npy --out {tmp_path}/i.onnx --report {tmp_path}/r"

@@ -67,7 +67,7 @@ def test_inputs_are_named_by_their_digest(tmp_path: Path) -> None:
 
 
 def strictly(text: str) -> object:
-    """Parse as JSON proper, which knows neither NaN nor Infinity."""
+    """Parse strict JSON, which has neither NaN nor Infinity."""
 
     def refuse(name: str) -> None:
         raise ValueError(name)
@@ -75,7 +75,7 @@ def strictly(text: str) -> object:
     return json.loads(text, parse_constant=refuse)
 
 
-def test_what_is_written_is_the_document(tmp_path: Path) -> None:
+def test_a_saved_table_is_a_valid_document(tmp_path: Path) -> None:
     row = Row("t", "row", {"a": measured(1.5, "s", "here")}, {"remedy": "none"})
     table = Table("test", {"seed": 0, "json": None}, (), (row,))
     assert table.save(tmp_path / "made" / "a.json") == tmp_path / "made" / "a.json"
@@ -91,9 +91,7 @@ def test_a_document_without_rows_is_invalid() -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 0.0])
 def test_a_gate_on_a_network_gone_wrong_still_writes_json(value: float, tmp_path: Path) -> None:
-    """A network that gives NaN has no MAE: unavailable with a reason, in JSON that every reader
-    takes.
-    """
+    """If a network returns NaN, the MAE is unavailable with a reason, in valid JSON."""
     coverage = SampleRange(0, 0, 1, 1, 0)
     spread = Spread(np.ones(1), np.zeros(1), np.zeros(1))
     result = GateResult(
@@ -117,7 +115,7 @@ def test_a_gate_on_a_network_gone_wrong_still_writes_json(value: float, tmp_path
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_no_figure_is_other_than_finite(value: float) -> None:
-    """It cannot be made, and what measured it says so: unavailable, with the reason."""
+    """A figure that is not finite cannot be built. Instead it is unavailable, with the reason."""
     for mode in ("measured", "predicted", "published"):
         with pytest.raises(ValueError, match="not finite"):
             Figure(value, "s", mode, "here", (0, 1))
@@ -144,7 +142,7 @@ def judged(*checks: Check, command: str = "gate") -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("checks", "verdict"), [(CHECKS[:1], "passed"), (CHECKS, "failed")])
-def test_a_verdict_stands_beside_its_checks(checks: tuple[Check, ...], verdict: str) -> None:
+def test_a_document_has_its_verdict_and_its_checks(checks: tuple[Check, ...], verdict: str) -> None:
     content = judged(*checks)
     jsonschema.validate(strictly(json.dumps(content, allow_nan=False)), SCHEMA)
     assert content["verdict"] == verdict
@@ -179,7 +177,7 @@ def test_a_command_that_judges_has_a_verdict(command: str) -> None:
         {"host": {"system": "Linux"}},
     ],
 )
-def test_a_verdict_that_its_checks_do_not_bear_out_is_invalid(change: dict[str, object]) -> None:
+def test_a_verdict_that_contradicts_its_checks_is_invalid(change: dict[str, object]) -> None:
     content = judged(CHECKS[0])
     jsonschema.validate(content, SCHEMA)
     with pytest.raises(jsonschema.ValidationError):
@@ -198,10 +196,10 @@ def test_a_printed_table_shows_its_figures_and_notes() -> None:
     assert not any(line != line.rstrip() for line in text.splitlines())
 
 
-def test_results_say_what_they_were_measured_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_name_the_processor_and_its_load(monkeypatch: pytest.MonkeyPatch) -> None:
     assert host()["processor"] == processor_name()
     monkeypatch.setattr(platform, "system", lambda: "Windows")
-    # On Windows psutil's first answer is a zero that means unknown.
+    # On Windows, psutil first returns a zero that means unknown.
     assert host()["load_1_min"] is None
 
 

@@ -64,7 +64,7 @@ def test_no_line_is_wider_than_the_terminal(name: str, width: int) -> None:
 
 
 def test_every_figure_of_a_wide_row_is_read_at_80_columns() -> None:
-    """More figures than rows: one line a figure, so that no column is squeezed."""
+    """With more figures than rows, each figure has a line, so that no column is too narrow."""
     lines = shown(WIDE, 80).splitlines()
     for k in range(12):
         assert any(
@@ -75,7 +75,7 @@ def test_every_figure_of_a_wide_row_is_read_at_80_columns() -> None:
 
 @given(st.integers(40, 200))
 def test_long_names_give_way_before_a_figure_is_cut(width: int) -> None:
-    """Names are wrapped, and the figures next to them are wide: each has its interval and mode."""
+    """Names are wrapped, so that each of the wide figures keeps its interval and mode."""
     figures = {f"figure {k}": predicted(913_456, "px", (503_456, 1_660_123), "m") for k in range(4)}
     stated = {key: published(77_777, "px", "paper") for key in figures}
     name = "convbeers-s, INT8 on the DPU (C32B3), whole tiles, halo 22 px"
@@ -94,7 +94,7 @@ def test_a_missing_figure_is_a_dash_with_its_reason_once() -> None:
 
 
 def test_a_tag_is_a_word_and_no_unit() -> None:
-    """An m beside a number of metres or seconds was read as their unit."""
+    """A tag m next to a number of metres or seconds was mistaken for the unit."""
     mixed = [
         Row("t", "ours", {"time": measured(1.586, "s", "here")}),
         Row("t", "board", {"time": predicted(2, "s", (1, 3), "model")}),

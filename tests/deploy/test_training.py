@@ -1,4 +1,4 @@
-"""`train` from options to a folder of results."""
+"""Tests of `train` from options to a folder of results."""
 
 import csv
 import shutil
@@ -41,7 +41,7 @@ def run(images: Path, out: Path, more: str = "", steps: int = 4) -> str:
 
 @pytest.fixture(scope="module")
 def finished(images: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a run, to be read or copied."""
+    """Return the folder of a run, which tests only read or copy."""
     folder = tmp_path_factory.mktemp("finished") / "r"
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("BEERS_LPIPS_WEIGHTS", raising=False)
@@ -54,7 +54,7 @@ def rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_a_run_leaves_logs_pictures_and_weights_that_tell_how_they_were_made(
+def test_a_run_writes_logs_pictures_and_weights_with_their_recipe(
     finished: Path,
 ) -> None:
     assert [row["step"] for row in rows(finished / "validation.csv")] == ["2", "4"]
@@ -68,9 +68,7 @@ def test_a_run_leaves_logs_pictures_and_weights_that_tell_how_they_were_made(
 
 
 def test_a_run_is_not_resumed_with_other_data(images: Path, finished: Path, tmp_path: Path) -> None:
-    """Another image, another sensor, another patch: each would end in weights that no single run
-    gives.
-    """
+    """With another image, sensor or patch, the weights would be those of no single run."""
     other = Path(shutil.copytree(images, tmp_path / "other"))
     image = sorted(other.glob("*.png"))[0]
     pixels = np.array(Image.open(image))
@@ -104,7 +102,7 @@ def test_nothing_is_resumed_in_an_empty_folder(images: Path, tmp_path: Path) -> 
 
 
 def test_pictures_are_not_written_among_the_images(images: Path) -> None:
-    """The picture of the validation would be an image of the next run."""
+    """Otherwise the picture of the validation would be an image of the next run."""
     before = sorted(images.iterdir())
     assert "folder of an input" in refused(f"train --images {images} --out {images} --steps 1")
     assert sorted(images.iterdir()) == before
@@ -137,7 +135,7 @@ def test_a_checkpoint_with_a_flipped_bit_is_refused(
             run(images, folder, "--validate-every 2 --resume")
 
 
-def test_a_conditioned_run_goes_on_from_others_and_resumes_to_the_same(
+def test_a_conditioned_run_starts_from_other_weights_and_resumes_to_the_same(
     images: Path, tmp_path: Path
 ) -> None:
     options = f"--conditioned --start {banked_weights(tmp_path)} --validate-every 2"
@@ -193,7 +191,7 @@ def test_roundings_of_anything_but_the_start_are_refused(
 
 
 def banked_weights(folder: Path) -> Path:
-    """Of a small network behind a bank, that give something else for each sensor."""
+    """Write the weights of a small network behind a bank, whose results depend on the sensor."""
     save_network(folder / "start.safetensors", behind_a_bank(VARIANTS["convbeers-xs"], 0.1), {})
     return folder / "start.safetensors"
 
@@ -255,7 +253,7 @@ def test_wrong_options_get_one_sentence(options: str, words: str, tmp_path: Path
 def test_pairs_bring_their_sensor_and_its_full_scale(
     images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of 14 bits, and of another MTF along the track than across it."""
+    """The sensor has 14 bits, and its MTF along the track differs from that across it."""
     along = 'mtf_nyquist_along = { value = 0.05, status = "measured", source = "a test" }'
     own = own_sensor(
         tmp_path, ("bits = { value = 12", "bits = { value = 14"), ("[mtf]", f"[mtf]\n{along}")
@@ -290,7 +288,7 @@ def test_a_run_that_ends_in_nan_leaves_no_weights(more: str, images: Path, tmp_p
     assert not list((tmp_path / "r").glob("convbeers*"))
 
 
-def test_a_run_in_the_way_is_not_overwritten(images: Path, finished: Path) -> None:
+def test_an_earlier_run_is_not_overwritten(images: Path, finished: Path) -> None:
     options = "--variant convbeers-xs --steps 1"
     assert "--resume" in refused(f"train --images {images} --out {finished} {options}")
 
@@ -308,7 +306,7 @@ def test_a_larger_network_starts_where_a_smaller_one_stopped(
     assert all(torch.allclose(weights[0][name], weights[1][name]) for name in weights[0])
 
 
-def test_a_log_forgets_what_lies_beyond_the_step_resumed_from(tmp_path: Path) -> None:
+def test_a_log_drops_the_lines_after_the_step_resumed_from(tmp_path: Path) -> None:
     log = Log(tmp_path / "log.csv", 0)
     for step in (100, 200, 300):
         log.write(step, {"l1": step / 1000})

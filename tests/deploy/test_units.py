@@ -1,4 +1,4 @@
-"""A digital number means the same in a degraded image and in its reference, for any digitiser."""
+"""Test that a digital number means the same in a degraded image and in its reference."""
 
 import logging
 from dataclasses import replace

@@ -1,5 +1,5 @@
-"""Documents, weights and folders that others wrote, each once the end of a run: now a sentence, or
-no matter.
+"""Tests of documents, weights and folders of others that once crashed a run. Now each is refused in
+one sentence or ignored.
 """
 
 import hashlib
@@ -39,11 +39,11 @@ def test_a_name_too_long_for_the_disk_is_a_sentence(tmp_path: Path) -> None:
             reader(tmp_path / name)
 
 
-Spoil = Callable[[dict[str, torch.Tensor]], object]
+Corrupt = Callable[[dict[str, torch.Tensor]], object]
 
 
 @pytest.mark.parametrize(
-    "spoil",
+    "corrupt",
     [
         lambda t: t.pop("average.tail.bias"),
         lambda t: t.update({"average.other": torch.zeros(1)}),
@@ -57,13 +57,13 @@ Spoil = Callable[[dict[str, torch.Tensor]], object]
         lambda t: t.update({"network.tail.bias": torch.full((1,), float("nan"))}),
     ],
 )
-def test_a_spoilt_checkpoint_is_refused(spoil: Spoil, tmp_path: Path) -> None:
+def test_a_corrupted_checkpoint_is_refused(corrupt: Corrupt, tmp_path: Path) -> None:
     path = tmp_path / "c.safetensors"
     path.write_bytes(checkpoint_seeds(tmp_path)[1])
     go_on(path)
     by_name, header = read_weights(path)
     tensors = {name: torch.from_numpy(array) for name, array in by_name.items()}
-    spoil(tensors)
+    corrupt(tensors)
     write_tensors(path, arrays(tensors), header)
     with pytest.raises(ModelError, match="checkpoint of this network"):
         go_on(path)
@@ -136,12 +136,12 @@ def test_a_journal_that_counts_rows_that_are_not_there_is_refused(
 @pytest.mark.parametrize(
     "line", ["", "{}", "[]", "3", "[" * 5000, '{"degraded": {"rejected_snr_pairs": "x"}}']
 )
-def test_no_pair_is_taken_from_a_manifest_that_is_none(line: str, tmp_path: Path) -> None:
+def test_no_pair_is_read_from_an_invalid_manifest(line: str, tmp_path: Path) -> None:
     (tmp_path / "manifest.jsonl").write_text(line + "\n")
     assert matching_lines(tmp_path, [tmp_path / "manifest.jsonl"]) == {}
 
 
-def test_a_log_with_strange_lines_is_gone_on_with(tmp_path: Path) -> None:
+def test_a_log_with_strange_lines_is_continued(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     path.write_bytes(
         "step,loss\n1,0.5\n²,1\n12abc\n30,2\n".encode() + b"\xff\xfe\n" + b"9" * 5000 + b",1\n"
@@ -168,7 +168,7 @@ POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize
     ],
 )
 @pytest.mark.parametrize("kind", ["pointer", "folder"])
-def test_what_stands_in_place_of_a_file_is_named(
+def test_a_pointer_or_folder_in_place_of_a_file_is_named(
     command: list[str], name: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -179,7 +179,7 @@ def test_what_stands_in_place_of_a_file_is_named(
     assert ("it is a folder" if kind == "folder" else "'git lfs pull'") in message
 
 
-def test_a_mark_at_the_beginning_of_a_text_is_no_part_of_it(tmp_path: Path) -> None:
+def test_a_byte_order_mark_is_no_part_of_a_text(tmp_path: Path) -> None:
     (tmp_path / "limits.toml").write_bytes(b"\xef\xbb\xbfmae = 0.5\n")
     (tmp_path / "one.json").write_bytes(b"\xef\xbb\xbf[1]")
     assert read_toml_text(tmp_path / "limits.toml") == {"mae": 0.5}

@@ -1,5 +1,5 @@
-"""A verdict can be read by a CI job, and its baseline is the document of a gate that passed on the
-same patches: every other file is refused.
+"""Test that a CI job can read a verdict, and that a baseline must be the document of a gate that
+passed on the same patches.
 """
 
 import json
@@ -34,13 +34,13 @@ def document(mae: float = 5e-4, **arguments: object) -> dict[str, Any]:
     return Table("gate", {**ASKED, **arguments}, inputs, (row,), (check,)).to_dict()
 
 
-def written(path: Path, content: object) -> Path:
+def write_json(path: Path, content: object) -> Path:
     path.write_text(json.dumps(content))
     return path
 
 
-def test_what_a_gate_wrote_is_read(tmp_path: Path) -> None:
-    baseline = read_baseline(written(tmp_path / "b.json", document()), ASKED)
+def test_the_document_of_a_gate_is_a_baseline(tmp_path: Path) -> None:
+    baseline = read_baseline(write_json(tmp_path / "b.json", document()), ASKED)
     assert (baseline.mae, baseline.psnr_float_db) == (5e-4, 50.0)
     assert baseline.digests == {"float.onnx": {"a" * 64}, "sensor s": {"b" * 64}}
     assert baseline.checks == {"MAE"}
@@ -74,10 +74,10 @@ def test_a_document_that_is_no_baseline_is_refused(
     content = document()
     change(content)
     with pytest.raises(OptionError, match=message):
-        read_baseline(written(tmp_path / "b.json", content), ASKED)
+        read_baseline(write_json(tmp_path / "b.json", content), ASKED)
 
 
-def test_a_key_that_stands_twice_is_refused(tmp_path: Path) -> None:
+def test_a_key_that_occurs_twice_is_refused(tmp_path: Path) -> None:
     text = json.dumps(document())
     (tmp_path / "b.json").write_text(text.replace('"verdict":', '"verdict": 0, "verdict":'))
     with pytest.raises(OptionError, match="key 'verdict' twice"):
@@ -91,7 +91,7 @@ def test_a_key_that_stands_twice_is_refused(tmp_path: Path) -> None:
 def test_a_baseline_of_other_patches_is_refused_and_a_folder_may_lie_elsewhere(
     other: dict[str, object], tmp_path: Path
 ) -> None:
-    path = written(tmp_path / "b.json", document(images="/here/ground"))
+    path = write_json(tmp_path / "b.json", document(images="/here/ground"))
     asked = {**ASKED, "images": Path("there/ground")}
     assert read_baseline(path, asked).mae == 5e-4
     (name,) = other
@@ -113,7 +113,7 @@ def test_the_float_network_is_known_by_its_digest_or_its_psnr() -> None:
 
 
 @pytest.mark.parametrize("digest", ["c" * 64, "a" * 64])
-def test_what_else_it_rests_on_must_be_the_same(digest: str) -> None:
+def test_the_other_inputs_of_a_baseline_must_be_the_same(digest: str) -> None:
     BEFORE.require_same("a" * 64, 50.0, [Input("sensor s", "b" * 64)])
     with pytest.raises(OptionError, match="sensor s had other content"):
         BEFORE.require_same("a" * 64, 50.0, [Input("sensor s", digest)])
@@ -125,7 +125,7 @@ def test_what_else_it_rests_on_must_be_the_same(digest: str) -> None:
 
 
 def test_a_baseline_of_other_samples_in_memory_is_refused(model: Path, tmp_path: Path) -> None:
-    """Also where both networks are files of one name."""
+    """This holds also if both networks are files of one name."""
     (tmp_path / "int8").mkdir()
     values = np.random.default_rng(0).random((8, 1, 32, 40), np.float32)
     int8 = bd.quantize(model, samples=values).save(tmp_path / "int8" / model.name)
@@ -139,7 +139,7 @@ def test_a_baseline_of_other_samples_in_memory_is_refused(model: Path, tmp_path:
     assert "its --samples is in memory, but here it is None" in refused(words)
 
 
-def test_a_baseline_holds_the_mae(scenes: Path, tmp_path: Path) -> None:
+def test_a_baseline_limits_the_mae(scenes: Path, tmp_path: Path) -> None:
     first = tmp_path / "first.json"
     second = tmp_path / "again.json"
     command = f"gate --images {scenes} --patches 2"
@@ -160,7 +160,7 @@ def test_a_baseline_holds_the_mae(scenes: Path, tmp_path: Path) -> None:
     ("content", "words"),
     [(None, "no such file"), ("", "an empty file"), ("[]", "not of type"), ("{}", "required")],
 )
-def test_what_is_no_document_gets_one_sentence(
+def test_an_invalid_document_is_refused_in_one_sentence(
     content: str | None, words: str, tmp_path: Path
 ) -> None:
     if content is not None:
@@ -187,7 +187,7 @@ def test_a_job_can_read_the_verdict() -> None:
 def test_the_last_line_names_what_failed_and_nothing_else() -> None:
     assert Table(command="gate", checks=tuple(CHECKS[:1])).verdict == "gate passed, all 1 checks"
     text = Table(command="gate", checks=tuple(CHECKS)).verdict
-    # A node's name may hold what a terminal or a CI's log would obey.
+    # A node's name may contain commands for a terminal or a CI's log.
     assert text.isprintable()
     assert text.startswith(
         "gate FAILED, 2 of 4 checks: PSNR drop 0.31 dB, allowed at most 0.25; nodes <all> 1 (tail"

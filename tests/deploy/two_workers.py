@@ -1,4 +1,4 @@
-"""A Dask cluster of this machine, for tests of what is computed on one."""
+"""A Dask cluster of this machine, for tests that compute on a cluster."""
 
 import logging
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ from typing import Any
 
 @contextmanager
 def local_cluster(workers: int = 2) -> Iterator[Any]:
-    """A distributed.LocalCluster of so many processes with a thread each."""
+    """Yield a distributed.LocalCluster of `workers` processes with one thread each."""
     no_page = {"dashboard_address": "127.0.0.1:0", "scheduler_kwargs": {"dashboard": False}}
     options = {
         "processes": True,

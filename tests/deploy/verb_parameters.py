@@ -1,4 +1,4 @@
-"""The parameters of all commands, with what they say of paths, and values for them."""
+"""The parameters of all commands, what their annotations state about paths, and values for them."""
 
 from dataclasses import dataclass
 from inspect import Parameter
@@ -35,12 +35,12 @@ GIVEN = {
     "with_": "haze",
     "without": "haze",
 }
-"""Values of text that are not the default, and that are not refused for themselves."""
+"""Texts that are not the default and that are valid by themselves."""
 
 
 @dataclass(frozen=True)
 class Option:
-    """A parameter of a verb as the command line has it."""
+    """A parameter of a verb on the command line."""
 
     command: str
     parameter: Parameter
@@ -55,7 +55,7 @@ class Option:
 
     @property
     def label(self) -> str:
-        """As it is typed; a switch that is on by default is typed only to turn it off."""
+        """Return the option as it is typed. A switch that is on by default has a --no- in front."""
         if self.is_argument:
             return metavar_of(self.parameter)
         option = option_of(self.name)
@@ -76,24 +76,24 @@ class Option:
 
     @property
     def is_input(self) -> bool:
-        """True for a path that is read; names of shipped things may be paths as well."""
+        """Return True for a path that is read. Names of shipped files may be paths as well."""
         named = self.name in ("sensor", "reference", "target", "network", "methods", "name")
         names = self.name.endswith("_network") or named
         return self.written is None and (names or read_as(self.parameter.annotation)[0] is Path)
 
     def words(self, value: object) -> list[str]:
-        """The parameter with a value, as words of a command line."""
+        """Return the parameter with a value, as words of a command line."""
         return [str(value)] if self.is_argument else [self.label, str(value)]
 
     def switched(self) -> list[str]:
-        """The parameter with a value that is not its default, as words of a command line."""
+        """Return the parameter with a value that is not its default, as words of a command line."""
         hint, _ = read_as(self.parameter.annotation)
         if hint is bool:
             return [self.label]
         return self.words(self.value(hint))
 
     def value(self, hint: Any) -> object:
-        """A value that is not the default."""
+        """Return a value that is not the default."""
         if self.name in GIVEN and hint is not Path:
             return GIVEN[self.name]
         if hint is Path:
@@ -112,7 +112,7 @@ def existing(name: str) -> str:
 
 
 def options(command: str) -> dict[str, Option]:
-    """The parameters of a command by name, in the order of its help."""
+    """Return the parameters of a command by name, in the order of its help."""
     return {
         parameter.name: Option(command, parameter) for parameter in COMMANDS[command].parameters
     }

@@ -1,9 +1,8 @@
-"""Runs what a GitHub workflow or a composite action would: its steps as shell, one after the other,
-in a folder.
+"""Run the shell steps of a GitHub workflow or a composite action, one after the other, in a folder.
 
-Of the expressions and the conditions only those are understood that our own files use; any other is
-an error, and so is a name that nothing defines. Steps of other actions (checkout, setup-python,
-uploads) are left out, as are those that install.
+Only the expressions and conditions of our own files are supported. Any other is an error, and so is
+a name that nothing defines. Steps of other actions (checkout, setup-python, uploads) and steps that
+install are skipped.
 """
 
 import os
@@ -23,14 +22,14 @@ ACTION = ROOT / "action.yml"
 EXPRESSION = re.compile(r"\$\{\{ (.+?) \}\}")
 IS_EMPTY = re.compile(r"([\w.-]+) == ''")
 BASH = ["bash", "--noprofile", "--norc", "-eo", "pipefail", "-c"]
-"""As GitHub runs `shell: bash`."""
+"""The command with which GitHub runs `shell: bash`."""
 
 SHORT = {"quantize": "--patches 2 --patch 32", "gate": "--patches 2"}
-"""What the tests add to commands, so that they take seconds."""
+"""Options that the tests add to commands, so that they take seconds."""
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """A workflow or an action."""
+    """Read a workflow or an action."""
     content: dict[str, Any] = yaml.safe_load(path.read_text(encoding="utf-8"))
     return content
 
@@ -41,10 +40,10 @@ class Runner:
 
     Attributes:
         folder: the workspace.
-        red: whether a step has failed; those after it are left out, unless they always run.
-        stderr: what the failed step wrote there.
-        stdout: what all steps wrote there, workflow commands among it.
-        outputs: of the steps, by "steps.ID.outputs.NAME".
+        red: whether a step has failed; later steps are skipped, unless they always run.
+        stderr: the standard error of the failed step.
+        stdout: the standard output of all steps, with their workflow commands.
+        outputs: the outputs of the steps, by "steps.ID.outputs.NAME".
     """
 
     folder: Path
@@ -54,9 +53,7 @@ class Runner:
     outputs: dict[str, str] = field(default_factory=dict)
 
     def prepare(self) -> None:
-        """What is there before the first step: the commands, and a summary that another job's step
-        began.
-        """
+        """Write the commands, and a summary that an earlier step began."""
         (self.temporary / "command").mkdir(parents=True)
         self.summary.write_text("what a step before wrote\n")
         lines = [f'{name}) set -- "$@" {more};;' for name, more in SHORT.items()]
@@ -70,28 +67,28 @@ class Runner:
 
     @property
     def temporary(self) -> Path:
-        """What RUNNER_TEMP names."""
+        """Return the folder of RUNNER_TEMP."""
         return self.folder.parent / "temporary"
 
     @property
     def summary(self) -> Path:
-        """What GITHUB_STEP_SUMMARY names."""
+        """Return the file of GITHUB_STEP_SUMMARY."""
         return self.temporary / "summary.md"
 
     @property
     def calls(self) -> Path:
-        """The arguments of every call of beers-deploy, a line each."""
+        """Return the file with the arguments of every call of beers-deploy, a line each."""
         return self.temporary / "calls"
 
     def command(self, name: str, before: str, arguments: str) -> None:
-        """Put a command on the path that does something and then runs ours."""
+        """Put a command on the path that runs `before` and then our command."""
         real = Path(sysconfig.get_path("scripts")) / "beers-deploy"
         path = self.temporary / "command" / name
         path.write_text(f'#!/usr/bin/env bash\n{before}\nexec "{real}" {arguments}\n')
         path.chmod(0o755)
 
     def run_action(self, values: dict[str, str]) -> dict[str, str]:
-        """The action with these inputs; its outputs."""
+        """Run the action with these inputs, and return its outputs."""
         action = read_yaml(ACTION)
         inputs = {name: str(about.get("default", "")) for name, about in action["inputs"].items()}
         assert values.keys() <= inputs.keys()
@@ -99,7 +96,7 @@ class Runner:
         context = {f"inputs.{name}": text for name, text in inputs.items()} | {
             "github.action_path": str(ROOT)
         }
-        # The step that would set this output is left out.
+        # The step that would set this output is skipped.
         context["steps.python.outputs.python-path"] = sys.executable
         # An action's steps have ids of their own.
         own = Runner(self.folder)
@@ -111,7 +108,7 @@ class Runner:
         return {name: value_of(about["value"], names) for name, about in action["outputs"].items()}
 
     def run_steps(self, steps: list[dict[str, Any]], context: dict[str, str]) -> None:
-        """Every step that its condition lets run."""
+        """Run every step whose condition holds."""
         for step in steps:
             condition = step.get("if", "")
             if condition != "always()" and (self.red or not holds(condition, context)):
@@ -129,7 +126,7 @@ class Runner:
                 self.run_shell(step, context)
 
     def run_shell(self, step: dict[str, Any], context: dict[str, str]) -> None:
-        """One step's script; what it writes to its outputs is kept even when it fails."""
+        """Run the script of one step, and collect its outputs even if it fails."""
         file = self.temporary / "outputs"
         file.write_text("")
         names = context | self.outputs
@@ -147,7 +144,7 @@ class Runner:
 
     @property
     def environment(self) -> dict[str, str]:
-        """What the runner gives to each step."""
+        """Return the environment variables that the runner sets for each step."""
         return {
             "PATH": f"{self.temporary / 'command'}:{os.environ['PATH']}",
             "HOME": str(self.temporary),
@@ -164,7 +161,7 @@ KEPT: dict[str, Any] = {"capture_output": True, "text": True, "check": False}
 
 
 def value_of(text: str, context: dict[str, str]) -> str:
-    """A text with its expressions replaced: names, or the first of several that is not empty."""
+    """Replace each expression in a text by the first of its names that is not empty."""
 
     def replaced(match: re.Match[str]) -> str:
         names = match[1].split(" || ")
@@ -174,8 +171,8 @@ def value_of(text: str, context: dict[str, str]) -> str:
 
 
 def lookup(name: str, context: dict[str, str]) -> str:
-    """A name's value, or a text in quotes; of an output that no step wrote, nothing, as GitHub has
-    it.
+    """Return a name's value, or a quoted text. An output that no step wrote is empty, as in
+    GitHub.
     """
     if name.startswith("'"):
         return name.strip("'")
@@ -187,7 +184,7 @@ def lookup(name: str, context: dict[str, str]) -> str:
 
 
 def holds(condition: str, context: dict[str, str]) -> bool:
-    """Whether a step runs: without a condition, or where an input is empty."""
+    """Return True if a step runs: it has no condition, or the input of its condition is empty."""
     if not condition:
         return True
     match = IS_EMPTY.fullmatch(condition)

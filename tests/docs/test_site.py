@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.deploy.browser import driven
+from tests.deploy.browser import run_script
 
 Run = Callable[..., Any]
 
@@ -106,7 +106,7 @@ def run(site: Path, tmp_path: Path) -> Run:
     def answer(script: str, *, dark: bool = False) -> Any:
         # Without a search no page needs the search index of a megabyte.
         missing = "search_index.json" if script.startswith(LOOK[:20]) else ""
-        return driven(site, script, tmp_path, dark=dark, missing=missing)
+        return run_script(site, script, tmp_path, dark=dark, missing=missing)
 
     return answer
 

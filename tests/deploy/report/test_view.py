@@ -21,7 +21,7 @@ from beers_deploy.report import view_layers
 from beers_deploy.report.view import TILE_PX, pyramid, write_view
 from beers_deploy.report.view_layers import SELF_CHECK, STATES, Layer, layers_of
 from beers_deploy.verbs.restore import restore
-from tests.deploy.browser import driven
+from tests.deploy.browser import run_script
 
 WIDTHS_PX = (1280, 390)
 HEIGHT = 600
@@ -243,7 +243,7 @@ def test_the_divider_separates_two_layers_on_a_desktop_and_on_a_telephone(
     site = tmp_path / "site"
     write_view(site / "view.html", image, restored, {SELF_CHECK: blocks}, False)
     script = LOOK.replace("WIDTHS", json.dumps(WIDTHS_PX))
-    for look in driven(site, script, tmp_path / "profile"):
+    for look in run_script(site, script, tmp_path / "profile"):
         left, right = look["halves"]
         width = look["width"]
         assert right[0] > left[0] + 20, (width, look)

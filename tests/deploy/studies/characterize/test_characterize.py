@@ -263,9 +263,9 @@ def test_arrays_are_read_like_files() -> None:
     """One number is an MTF, masked pixels are missing, and numbers below 0 do not wrap around."""
     noisy = np.random.default_rng(0).normal(np.linspace(200, 3000, 320)[:, None], 20, (320, 320))
     pixels = noisy.astype(np.int32)
-    spoilt = pixels.copy()
-    spoilt[:20] = 4095
-    masked = np.ma.masked_equal(spoilt, 4095)
+    corrupted = pixels.copy()
+    corrupted[:20] = 4095
+    masked = np.ma.masked_equal(corrupted, 4095)
     sensor = characterize(masked, bits=12, mtf=0.08)
     assert sensor.snr_pair == characterize(masked.filled(0), bits=12, mtf="0.08").snr_pair
     assert sensor.mtf_nyquist.low == 0.08

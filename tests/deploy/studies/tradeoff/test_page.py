@@ -21,7 +21,7 @@ from beers_deploy.studies.tradeoff.page import (
     series,
 )
 from beers_deploy.studies.tradeoff.run import weigh
-from tests.deploy.browser import seen
+from tests.deploy.browser import inspect_page
 from tests.deploy.studies.tradeoff.synthetic import family, question, synthetic
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -106,7 +106,9 @@ def test_the_page_fits_the_window_follows_the_theme_and_is_sorted_by_a_click(
     return [sizes, up, names(), head.getAttribute("aria-sort"), colour];"""
     result = study()
     html = render(report_of(result, plot_svg(result)))
-    sizes, up, down, state, colour = seen(html, look, tmp_path, width_px=width_px, dark=dark)
+    sizes, up, down, state, colour = inspect_page(
+        html, look, tmp_path, width_px=width_px, dark=dark
+    )
     overflow_px, natural_px, displayed_px = sizes
     assert overflow_px <= 0
     assert natural_px == SIZE_PX[0]
