@@ -126,10 +126,10 @@ def test_another_dataset_in_the_folder_is_not_overwritten(scene: Path, dataset: 
     assert bytes_of(dataset) == before
 
 
-def flip(path: Path, share: float = 0.5) -> None:
+def flip(path: Path) -> None:
     """Flip a bit in the middle of a file."""
     content = bytearray(path.read_bytes())
-    content[int(share * len(content))] ^= 1
+    content[len(content) // 2] ^= 1
     path.write_bytes(content)
 
 
