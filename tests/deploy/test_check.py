@@ -41,7 +41,7 @@ def test_a_network_of_one_tile_is_checked_at_that(tmp_path: Path) -> None:
     assert "--tile 96" in refused(f"check {tmp_path}/fixed.onnx --tile 640")
 
 
-def test_the_document_holds_subgraphs_cuts_and_remarks(tmp_path: Path) -> None:
+def test_the_document_contains_subgraphs_cuts_and_remarks(tmp_path: Path) -> None:
     sketch = Sketch(8)
     path = sketch.save(
         tmp_path / "bad.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image")))
@@ -91,7 +91,7 @@ def test_devices_and_refusals_are_shown_and_nodes_in_detail(tmp_path: Path) -> N
         assert headings[name] in map(str.strip, detailed.splitlines())
 
 
-def test_a_size_that_is_not_known_is_no_zero(tmp_path: Path) -> None:
+def test_an_unknown_size_is_not_shown_as_zero(tmp_path: Path) -> None:
     sketch = Sketch(4)
     odd = sketch.node("Mystery", sketch.conv("image", (4, 4, 3, 3)), domain="com.microsoft")
     path = sketch.save(tmp_path / "m.onnx", sketch.conv(odd, (4, 4, 3, 3)))

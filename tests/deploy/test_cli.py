@@ -60,7 +60,7 @@ def test_commands_without_a_sensor_use_the_same_one() -> None:
             if option.name == "sensor":
                 defaults[name] = option.default
     assert {"quantize", "gate", "evaluate"} <= set(defaults)
-    # A raw image is of a sensor that only its user knows.
+    # Only the user knows the sensor of a raw image.
     assert defaults.pop("restore") == "blind"
     assert set(defaults.values()) == {SENSOR, None}
 

@@ -114,7 +114,9 @@ def test_a_network_is_loaded_from_a_path_a_model_or_a_network(
         assert_array_equal(network(np.ones((1, 1, 9, 9))), tiny(np.ones((1, 1, 9, 9))))
 
 
-def test_int8_knows_its_float_network_and_its_layers(tiny: bd.Network, int8: bd.Network) -> None:
+def test_an_int8_network_has_its_float_network_and_its_layers(
+    tiny: bd.Network, int8: bd.Network
+) -> None:
     assert int8.origin == tiny
     assert int8.precision == "int8"
     assert [row.table for row in int8.layers] == ["integer layers", "integer layers", "rounding"]
@@ -339,9 +341,7 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_bad_input_is_one_sentence_and_the_class_that_one_expects(
-    case: str, raw: np.ndarray
-) -> None:
+def test_bad_input_raises_a_value_error_of_one_sentence(case: str, raw: np.ndarray) -> None:
     call, words = REFUSED[case]
     with pytest.raises(ValueError, match=words) as caught:
         call(raw)

@@ -108,7 +108,7 @@ def test_restore_maps_full_scale_onto_a_stated_range() -> None:
     """`restore` maps pixels to the stated range and back, and refuses a range that was only
     found in samples.
 
-    The largest sample is no full scale, so such a range says nothing about other images.
+    The largest sample is no full scale, so such a range is unknown for other images.
     """
     floating = network(TOP)
     given = samples(TOP)

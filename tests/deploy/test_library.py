@@ -1,4 +1,4 @@
-"""Test that arrays of NumPy, Dask and xarray are restored alike, and which arrays are refused."""
+"""Test that arrays of NumPy, Dask and xarray are restored to the same pixels, or refused."""
 
 from pathlib import Path
 from typing import Any

@@ -53,7 +53,7 @@ def test_a_command_names_the_number_of_cores(
 
 
 @pytest.mark.parametrize("seconds", ["0", "-1", "-0.0", "nan", "inf"])
-def test_a_swath_takes_some_time(seconds: str) -> None:
+def test_the_time_of_a_swath_must_be_positive(seconds: str) -> None:
     assert "--within" in refused("bench", "--no-traditional", "--within", seconds)
 
 

@@ -165,7 +165,7 @@ def test_none_is_the_default_network() -> None:
     assert Network.load(None) == Network.load(f"{VARIANT}{INT8}")
 
 
-def test_one_name_stands_for_a_shipped_pair() -> None:
+def test_one_name_loads_a_shipped_pair() -> None:
     for floating, int8 in (
         ("convbeers-xs", None),
         ("convbeers-xs-int8", None),

@@ -127,7 +127,7 @@ def test_the_gate_fails_a_network_whose_sums_overflow(tmp_path: Path, scenes: Pa
     assert "MAE nan" in output
 
 
-def test_the_gate_does_not_take_an_infinite_pixel_for_full_scale() -> None:
+def test_the_gate_does_not_clip_an_infinite_pixel_to_full_scale() -> None:
     """If both sides were clipped to 1, infinity in both networks would agree."""
     ends = [
         helper.make_tensor_value_info(name, 1, ["N", 1, "H", "W"]) for name in ("image", "restored")

@@ -166,9 +166,9 @@ def test_commands_do_not_contradict_each_other(
     output: str | None,
     **shape: bool,
 ) -> None:
-    """A network that check passes has integers that check passes, and that run.
+    """If check accepts a network, it also accepts the quantised network, which runs.
 
-    One that check refuses is refused by quantize, or has integers that check refuses.
+    If check refuses it, quantize refuses it too, or check refuses the quantised network.
     """
     path = tmp_path_factory.mktemp("drawn") / "a.onnx"
     drawn(path, parts, ends=ends, has_two=output is not None, **shape)

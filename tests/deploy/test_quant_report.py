@@ -41,7 +41,7 @@ def float_file(path: Path) -> str:
 
 @pytest.mark.parametrize("text", ["-1", "many", "2.5"])
 def test_steps_of_fine_tuning_are_whole_or_auto(text: str) -> None:
-    """The option `finetune` is 'auto' or a number of steps, and anything else is one sentence."""
+    """The option `finetune` is 'auto' or a number of steps. Any other text is refused."""
     assert (steps_of("auto"), steps_of(20), steps_of("0")) == (None, 20, 0)
     with pytest.raises(
         OptionError, match="`finetune` must be 'auto' or a whole number of steps from 0"
@@ -123,7 +123,7 @@ def spread(difference_dn: np.ndarray) -> Spread:
 
 
 @pytest.mark.parametrize("farthest", [0, 1, 40, 41, 137, 4095])
-def test_the_histogram_holds_every_error_in_few_bars(farthest: int) -> None:
+def test_the_histogram_shows_every_error_in_few_bars(farthest: int) -> None:
     """Every error is in one of few bars, and 0 is in the middle one, whatever the largest error
     is.
     """

@@ -35,7 +35,7 @@ def with_units(profile: Sensor, gain: float, bits: int, offset_dn: float = 0.0) 
 
 
 def rescaled(profile: Sensor, bits: int, dimmer: float, offset_dn: float) -> Sensor:
-    """Return a sensor of other bits, whose full scale, gain and offset grow alike.
+    """Return a sensor of other bits, whose full scale, gain and offset grow by one factor.
 
     Its scenes are dimmer by a factor, and its gain is higher by the same factor.
     """

@@ -184,7 +184,7 @@ def test_a_job_can_read_the_verdict() -> None:
     assert [case.find("failure") is not None for case in suite] == [False, True, True, False]
 
 
-def test_the_last_line_names_what_failed_and_nothing_else() -> None:
+def test_the_last_line_names_only_the_failed_checks() -> None:
     assert Table(command="gate", checks=tuple(CHECKS[:1])).verdict == "gate passed, all 1 checks"
     text = Table(command="gate", checks=tuple(CHECKS)).verdict
     # A node's name may contain commands for a terminal or a CI's log.

@@ -59,7 +59,7 @@ def test_maps_that_fit_the_banks_do_not_stream(tmp_path: Path) -> None:
     ("board", "rows", "columns", "parallel"),
     [("vck190", 8, 4, 32), ("zcu102", 8, 1, 16), ("vek280", 4, 8, 32)],
 )
-def test_rows_columns_and_channels_that_do_not_fill_the_array_take_time_all_the_same(
+def test_unused_rows_columns_and_channels_of_the_array_take_time_too(
     tmp_path: Path, board: str, rows: int, columns: int, parallel: int
 ) -> None:
     """The three columns of the first layer's one channel enter the array together, not in turn."""

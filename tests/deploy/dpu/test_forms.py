@@ -47,7 +47,7 @@ def test_a_layer_as_large_as_its_map_is_also_one_pixel_of_all_its_values(tmp_pat
         ((64, 512, 7, 7), 7, set()),
     ],
 )
-def test_a_fully_connected_layer_is_taken_in_any_form_that_fits(
+def test_a_fully_connected_layer_is_accepted_in_any_form_that_fits(
     tmp_path: Path, weight: tuple[int, ...], tile_px: int, rules: set[str]
 ) -> None:
     node = placed(tmp_path / "n.onnx", weight, tile_px)

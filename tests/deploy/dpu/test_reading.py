@@ -36,7 +36,7 @@ def test_an_unknown_operator_hides_the_shape_but_not_the_network(tmp_path: Path)
         _ = after.operations
 
 
-def test_a_model_fixed_to_another_tile_says_which(tmp_path: Path) -> None:
+def test_a_model_fixed_to_another_tile_is_refused_with_its_tile(tmp_path: Path) -> None:
     sketch = Sketch(2)
     for dimension in sketch.input.type.tensor_type.shape.dim[2:]:
         dimension.dim_value = 48
@@ -99,7 +99,7 @@ def test_the_usual_tile_has_whole_places(place_px: int, border_px: int, tmp_path
 
 
 @pytest.mark.parametrize("text", ["0", "half", "1000000"])
-def test_places_that_cannot_be_are_refused(text: str, tmp_path: Path) -> None:
+def test_impossible_places_are_refused(text: str, tmp_path: Path) -> None:
     model = board_model(quantized_half_resolution().core, {})
     next(entry for entry in model.metadata_props if entry.key == PLACE_PX).value = text
     save_onnx(model, tmp_path / "half.onnx")

@@ -247,7 +247,7 @@ def test_arrays_that_are_no_tensors_are_refused(kind: str, copied: Path, tmp_pat
     refused("golden", tmp_path / "seen", "--compare", copied)
 
 
-def test_an_index_leads_nowhere_else_and_its_claims_are_no_inputs(
+def test_an_index_with_outside_paths_is_refused_and_its_claims_are_ignored(
     copied: Path, tmp_path: Path
 ) -> None:
     shutil.copytree(copied / "noise", tmp_path / "seen" / "noise")

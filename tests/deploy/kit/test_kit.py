@@ -143,7 +143,7 @@ def test_the_host_part_refuses_what_it_cannot_restore(
 ) -> None:
     """An image of a wrong shape or too small for a tile is refused in one sentence.
 
-    No file is written, so that a partial result is never taken for a restored image.
+    No file is written, so that a partial result is never mistaken for a restored image.
     """
     np.save(tmp_path / "image.npy", np.full(shape, 0.1, np.float32))
     command = [sys.executable, "host.py", str(tmp_path / "image.npy"), str(tmp_path / "out.npy")]
@@ -154,7 +154,7 @@ def test_the_host_part_refuses_what_it_cannot_restore(
 
 
 def test_digital_numbers_in_the_place_of_shares_are_refused(kit: Path, tmp_path: Path) -> None:
-    """Otherwise all of them would be restored to white."""
+    """Otherwise all digital numbers would be restored to white."""
     np.save(tmp_path / "image.npy", np.full((1, 96, 96), 900, np.uint16))
     command = [sys.executable, "host.py", str(tmp_path / "image.npy"), str(tmp_path / "out.npy")]
     result = subprocess.run(command, cwd=kit, check=False, capture_output=True, text=True)
@@ -198,7 +198,7 @@ def test_each_exposure_has_a_core_and_a_unit(kit: Path, sensor: bd.Sensor) -> No
     assert golden == bd.Network.load(NAME, sensor=sensor).model
 
 
-def test_the_host_part_chooses_factors_and_takes_the_consistency_step_as_the_library_does(
+def test_the_host_part_chooses_factors_and_corrects_as_the_library_does(
     kit: Path, sensor: bd.Sensor, image: np.ndarray
 ) -> None:
     """They are equal bit for bit, with saturated pixels and without."""
@@ -310,7 +310,7 @@ def test_a_tile_without_room_between_its_halos_is_refused(
 
 
 def test_nothing_of_an_earlier_kit_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Otherwise its facts and its record would be read as those of the new cores."""
+    """Otherwise the old facts and record would be read as those of the new cores."""
     board = bd.Board.load("vck190")
     folder = board.kit(NAME, tmp_path / "kit", tile=TILE_PX, sensor="pleiades-degraded")
     (folder / "record").mkdir()

@@ -16,7 +16,7 @@ from tests.deploy.documents import figures_of, valid
 
 
 @pytest.mark.slow
-def test_the_demo_takes_a_raw_image_through_the_whole_chain(
+def test_the_demo_runs_the_whole_chain_on_a_raw_image(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """This test uses two patches. The first stage of .ci/run uses all."""

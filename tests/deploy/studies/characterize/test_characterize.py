@@ -95,7 +95,7 @@ def transfer(frequencies: np.ndarray, mtf_nyquist: float) -> np.ndarray:
     return np.asarray((mtf_nyquist * math.pi / 2) ** (2 * frequencies) * np.sinc(frequencies))
 
 
-def test_without_a_gain_the_noise_over_full_scale_stands(raw: tuple[Path, Path]) -> None:
+def test_without_a_gain_the_noise_over_full_scale_is_unchanged(raw: tuple[Path, Path]) -> None:
     """Only the noise over full scale matters to a network, and no gain changes it."""
     with_gain = measure(raw, stated=replace(KNOWN, gain=3.0))
     without_gain = measure(raw, stated=KNOWN)
@@ -191,7 +191,7 @@ def test_pairs_of_one_scene_give_the_noise_alone(tmp_path: Path) -> None:
         ("{}:2,2,30,40", "one straight edge"),
     ],
 )
-def test_a_box_that_holds_no_edge_is_refused(
+def test_a_box_without_an_edge_is_refused(
     raw: tuple[Path, Path], tmp_path: Path, box: str, words: str
 ) -> None:
     options = "--bits", 12, "--edge", box.format(raw[0]), "--out", tmp_path / "mine.toml"
@@ -285,7 +285,9 @@ def test_one_image_twice_or_images_of_two_gains_are_refused(
         measure([raw[0], raw[0]], stated=KNOWN)
 
 
-def test_pixels_clipped_at_full_scale_tell_the_bits(raw: tuple[Path, Path], tmp_path: Path) -> None:
+def test_pixels_clipped_at_full_scale_determine_the_bits(
+    raw: tuple[Path, Path], tmp_path: Path
+) -> None:
     pixels = tifffile.imread(raw[0]).copy()
     pixels[:4, :4] = 4095
     image = tiff(tmp_path, pixels)

@@ -129,7 +129,7 @@ def test_a_weight_counts_like_as_many_copies_for_pycocotools(
     seed: int, weights: list[int], ties: bool, size: str
 ) -> None:
     pairs = drawn(np.random.default_rng(seed), len(weights), ties)
-    # Copies of one image would be taken in another order where scores are equal.
+    # With equal scores, pycocotools would sort copies of an image in another order.
     weights = [min(weight, 1) for weight in weights] if ties else weights
     copies: Pairs = []
     for pair, weight in zip(pairs, weights, strict=True):
@@ -176,7 +176,7 @@ def test_precision_and_recall_are_those_of_what_is_left_at_a_confidence(
     np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-12)
 
 
-def test_sizes_are_told_apart_by_the_root_of_the_area() -> None:
+def test_sizes_are_distinguished_by_the_root_of_the_area() -> None:
     sides = (15.99, 16.0, 31.99, 32.0)
     squares = Boxes.of(
         [[0, 100.0 * i, side, 100.0 * i + side] for i, side in enumerate(sides)], [0] * 4
@@ -204,7 +204,7 @@ def test_every_row_is_read_at_the_first_one_s_confidence() -> None:
     assert figures["halved"]["recall"][0] != figures["halved"]["own recall"][0]
 
 
-def test_a_draw_takes_whole_sites_and_a_seed_gives_the_same_draws() -> None:
+def test_a_draw_has_whole_sites_and_a_seed_gives_the_same_draws() -> None:
     weights = site_weights(["a", "a", "b", "c"], 5, 200)
     assert weights[0].tolist() == [1, 1, 1, 1]
     assert (weights[:, 0] == weights[:, 1]).all()
@@ -213,7 +213,7 @@ def test_a_draw_takes_whole_sites_and_a_seed_gives_the_same_draws() -> None:
     assert not np.array_equal(weights, site_weights(["a", "a", "b", "c"], 6, 200))
 
 
-def test_a_class_that_no_site_of_a_draw_holds_drops_out() -> None:
+def test_a_class_without_an_object_in_a_draw_is_left_out() -> None:
     ship = Boxes.of(ONE, [0])
     pairs = [(ship, ship)] * 3 + [(Boxes.of(ONE, [1]), Boxes.of([], []))] * 2
     figures = score(hits_of(pairs, 2), ("ship", "tank"), site_weights(list("abcde"), 0, 400))

@@ -46,7 +46,7 @@ def test_suppression_keeps_the_best_and_no_more_than_300() -> None:
 
 @settings(max_examples=25)
 @given(SIDES, SIDES, st.integers(3, 8))
-def test_pixels_and_boxes_are_moved_alike_by_the_letterbox(
+def test_the_letterbox_maps_pixels_and_boxes_to_the_same_place(
     height: int, width: int, eighths: int
 ) -> None:
     """The values of this image are the coordinates of its pixels."""

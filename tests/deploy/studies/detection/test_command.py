@@ -31,7 +31,7 @@ SMALL = ("--sensor", "dior-medium", "--methods", "degraded")
 MAP = ("--classes", "Motor-Car=vehicle,Storage tank=tank")
 
 
-def test_synthetic_scenes_and_the_same_as_pictures_score_alike(
+def test_scenes_and_their_pictures_have_similar_scores(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Reading, class names, labels and sites lead to the scores of the scenes themselves, apart

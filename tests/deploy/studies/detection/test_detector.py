@@ -13,7 +13,7 @@ from beers_deploy.studies.detection.detector import class_numbers, open_detector
 from tests.deploy.studies.detection.networks import NAMES, detector, final, raw
 
 IMAGE = np.full((32, 64, 3), 0.5, np.float32)
-"""An input of 64 px does not resize it, and has 16 px of grey above and below it."""
+"""In an input of 64 px the image keeps its size, with 16 px of grey above and below."""
 ONE = raw((1, 1, 1, 1, 0.5, 0))
 
 

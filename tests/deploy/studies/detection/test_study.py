@@ -64,7 +64,7 @@ def bright(image: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("ratio", [2, 3, 4])
 @pytest.mark.parametrize("corners", [(24, 36, 84, 72), (60, 12, 96, 120), (131, 85, 190, 133)])
-def test_boxes_come_back_to_where_the_object_lies(
+def test_boxes_are_mapped_back_to_the_object(
     ratio: int, corners: tuple[int, int, int, int]
 ) -> None:
     acquisition = AcquiredScene(scene(corners, 149, 211), sensors(ratio=ratio), Draw(0))

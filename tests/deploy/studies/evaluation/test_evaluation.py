@@ -21,7 +21,7 @@ from tests.deploy.studies.evaluation.small_pairs import (
 )
 
 
-def test_strips_hold_every_method_and_black_below_the_reference() -> None:
+def test_strips_show_every_method_and_black_below_the_reference() -> None:
     one = pair()
     strip, white = strip_of(one, [IDENTITY, Method("zero", np.zeros_like, "blind")])
     side = 37 * 2

@@ -28,7 +28,7 @@ from tests.deploy.studies.evaluation.small_pairs import (
 )
 
 
-def test_pairs_come_back_from_a_folder(tmp_path: Path) -> None:
+def test_pairs_are_read_back_from_a_folder(tmp_path: Path) -> None:
     pairs = [pair("a_1.tif", 1), pair("b_2.tif", 2)]
     read_back = read_pairs(write_pairs(tmp_path, pairs))
     assert [item.name for item in read_back] == ["a_1", "b_2"]

@@ -89,7 +89,7 @@ def psnr(swept: Swept, condition: str) -> Callable[[str], float]:
     return lambda method: swept[0]["sweep, PSNR"][condition].figures[method].value or 0.0
 
 
-def test_a_network_that_can_know_the_sensor_knows_that_of_each_condition(swept: Swept) -> None:
+def test_a_network_that_accepts_a_sensor_is_given_that_of_each_condition(swept: Swept) -> None:
     """It is then given the supposed sensors. It never restores without a given sensor."""
     supposed_for = suppositions(NOMINAL, DEGRADED)
     supposed = [list(supposed_for[name].values()) for name in ("nominal", "MTF 3%")]
@@ -110,7 +110,7 @@ def test_knowing_the_true_sensor_helps_where_it_has_drifted(swept: Swept) -> Non
     assert dim("degraded") == pytest.approx(nominal("degraded") + 3.1, abs=0.5)
 
 
-def test_a_wrong_sensor_costs_the_methods_that_can_know_one(swept: Swept) -> None:
+def test_a_wrong_sensor_costs_the_methods_that_accept_one(swept: Swept) -> None:
     scores, losses = (swept[0][name] for name in WRONGLY)
     assert (
         list(scores)

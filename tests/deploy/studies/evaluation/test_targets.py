@@ -66,7 +66,7 @@ def test_flux_and_contrast_are_the_factor_of_a_linear_method_at_any_level(
     assert values(row, OF_REFERENCE) == pytest.approx([factor] * 5, abs=1e-4)
 
 
-def test_a_blur_takes_contrast_and_leaves_the_flux(perfect: Targets) -> None:
+def test_a_blur_lowers_the_contrast_but_not_the_flux(perfect: Targets) -> None:
     blurred = target_row(Method("blur", lambda dn: gaussian_filter(dn, 1.0), BLIND), perfect)
     assert values(blurred, "%") == pytest.approx([100] * 6, abs=3)
     period_2, period_267, period_3, *plates = values(blurred, OF_REFERENCE)
