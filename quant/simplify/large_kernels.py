@@ -8,7 +8,9 @@
 
 Where a part would begin or end inside the map, as with a kernel without padding, a depthwise
 convolution that reads one pixel crops the map first. All of it is exact except for the rounding of
-float32. A kernel is not split if one of its rows is too large.
+float32. A kernel is not split if one of its rows is too large. It is not split either if it has a
+side without padding and is longer than any target convolves with, because it may be that of a layer
+as large as its map, which targets compute in another way.
 """
 
 import numpy as np
@@ -20,6 +22,8 @@ MOST_POSITIONS = 49
 """Height times width of a part, 7 x 7. Every target computes at most 53."""
 LARGE_POSITIONS = 64
 """Height times width, 8 x 8, up to which a kernel is not split, because some targets compute it."""
+LONGEST_SIDE = 16
+"""The longest side of a kernel that is split although a side has no padding."""
 
 
 def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
@@ -40,12 +44,13 @@ def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
     outputs, channels, rows, columns = weight.shape
     states_pads = node.attributes.get("auto_pad", "NOTSET") == "NOTSET"
     channels *= node.attributes.get("group", 1)
+    pads = node.attributes.get("pads", [0, 0, 0, 0])
     is_large = rows * columns > LARGE_POSITIONS
-    if not (is_large and states_pads and columns <= MOST_POSITIONS):
+    is_whole_map = min(pads) == 0 and max(rows, columns) > LONGEST_SIDE
+    if not (is_large and states_pads and columns <= MOST_POSITIONS) or is_whole_map:
         return None
     # A part may have MOST_POSITIONS // columns rows, so this is the least number of parts.
     step = -(-rows // (MOST_POSITIONS // columns))
-    pads = node.attributes.get("pads", [0, 0, 0, 0])
     dilations = node.attributes.get("dilations", [1, 1])
     name = node.proto.name or node.outputs[0]
     nodes: list[Node] = []
