@@ -26,7 +26,7 @@ from beers_deploy.quant.structure import count_relus, rounded_tensors, saturated
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from tests.deploy.dpu.graphs import board_convbeers, float_convbeers, integer_convbeers
 from tests.fuzz.pictures import written
-from tests.quant.simplify.networks import CASES, made
+from tests.quant.simplify.networks import CASES, network_from
 
 SIDE_PX = 16
 RECIPE = TrainingRecipe(steps=10)
@@ -57,10 +57,10 @@ def exported_seeds(_: Path) -> list[bytes]:
     scaled = CASES["normalised and scaled again"][0]
     idle = CASES["what does nothing"][0]
     networks = [
-        made(sizes),
-        made(scaled, 9),
-        made(sizes, 20),
-        made(idle, kind="float16"),
+        network_from(sizes),
+        network_from(scaled, 9),
+        network_from(sizes, 20),
+        network_from(idle, kind="float16"),
     ]
     return [network.SerializeToString() for network in networks]
 

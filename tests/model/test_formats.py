@@ -14,7 +14,7 @@ from beers_deploy.model.io.tensors import read_tensors
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import load_onnx
 from tests.deploy.command_line import refused
-from tests.quant.simplify.networks import CASES, made
+from tests.quant.simplify.networks import CASES, network_from
 
 LAYER = torch.nn.Conv2d(1, 1, 3)
 STATE = LAYER.state_dict()
@@ -82,4 +82,4 @@ def test_weights_in_another_format_are_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("case", CASES)
 def test_no_exporters_file_is_another_format(case: str) -> None:
-    assert other_format(made(CASES[case][0]).SerializeToString()[:HEAD_BYTES]) is None
+    assert other_format(network_from(CASES[case][0]).SerializeToString()[:HEAD_BYTES]) is None

@@ -72,10 +72,11 @@ def parsed(
     """Return a network from ONNX's own text format.
 
     Args:
-        nodes: such as "y = Relu(x)"; a node without a name has that of operator and result.
+        nodes: such as "y = Relu(x)"; a node without a name is named after its operator and
+            result.
         ends: input and output, such as "float[N,4,H,W] x => float[N,4,H,W] y".
-        opset: of ONNX's operators.
-        constants: which become initializers if a node reads them.
+        opset: the version of ONNX's operators.
+        constants: arrays that become initializers if a node reads them.
     """
     source, result = ends.split(" => ")
     domains = f'"": {opset}' + (', "com.microsoft": 1' if "com.microsoft" in nodes else "")
@@ -91,7 +92,7 @@ def parsed(
     return model
 
 
-def made(
+def network_from(
     nodes: str,
     opset: int = OPSET,
     kind: str = "float",
@@ -102,10 +103,10 @@ def made(
 
     Args:
         nodes: in ONNX's text format.
-        opset: of ONNX's operators.
+        opset: the version of ONNX's operators.
         kind: the type of image, weights and results.
-        ends: as in `parsed`, if others than these.
-        constants: by name.
+        ends: as in `parsed`; by default those of `x` and `y`.
+        constants: further constants, by name.
     """
     ends = ends or f"{kind}[N,{CHANNELS},H,W] x => {kind}[N,C,H2,W2] y"
     model = parsed(nodes, ends, opset, {**values(), **constants})

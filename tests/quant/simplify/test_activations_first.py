@@ -1,4 +1,4 @@
-"""Activations move into convolutions, through whatever only moves values, and change no result."""
+"""Tests that activations move past operators that only move values, into convolutions."""
 
 from typing import Any
 
@@ -32,7 +32,7 @@ def moving(writer: GraphWriter, kind: str, source: str, beside: str) -> str:
 
 
 def network(kinds: list[str], activation: str, read_twice: bool = False) -> onnx.ModelProto:
-    """Convolutions, operations that move values, an activation, and a last convolution."""
+    """Build two convolutions, operations that move values, an activation and a last convolution."""
     generator = np.random.default_rng(1)
     writer = GraphWriter()
 
@@ -84,7 +84,7 @@ def test_an_activation_reaches_its_convolutions(kinds: list[str], activation: st
 
 
 @pytest.mark.parametrize("kind", ["AveragePool", "linear"])
-def test_an_activation_stays_behind_what_computes_means(kind: str) -> None:
+def test_an_activation_stays_behind_operators_that_compute_means(kind: str) -> None:
     model = network([kind], "Relu")
     assert activations_first(model) is model
 

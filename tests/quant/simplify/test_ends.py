@@ -1,4 +1,4 @@
-"""Both ends of a network: channels last, as in TensorFlow, missing borders, and strided slices."""
+"""Tests of channels-last networks (TensorFlow), of missing borders and of strided slices."""
 
 from itertools import pairwise
 from typing import Any
@@ -13,7 +13,7 @@ from onnx.reference import ReferenceEvaluator
 from beers_deploy.quant.graph import read_network, refusal
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.simplify import simplify
-from tests.quant.simplify.networks import CHANNELS, CONV, SAME, made
+from tests.quant.simplify.networks import CHANNELS, CONV, SAME, network_from
 
 IMAGE = np.random.default_rng(4).uniform(0, 1, (1, CHANNELS, 18, 23)).astype(np.float32)
 
@@ -31,7 +31,7 @@ def sized(model: onnx.ModelProto, rows: int, columns: int) -> onnx.ModelProto:
 def test_a_network_of_channels_last_becomes_one_of_channels_first() -> None:
     """TensorFlow's exporters leave a Transpose at either end."""
     sizes = f"[N,H,W,{CHANNELS}]"
-    model = made(
+    model = network_from(
         f"t = Transpose<perm=[0,3,1,2]>(x) c = {SAME}(t, w) y = Transpose<perm=[0,2,3,1]>(c)",
         ends=f"float{sizes} x => float{sizes} y",
     )
@@ -55,7 +55,7 @@ PARTS = (
     "Pad({}, pads_last)",
     "ReduceMean<axes=[1,2]>({})",
 )
-"""Operators on a tensor of channels last, which stands in the place of the braces."""
+"""Operators on a channels-last tensor; the braces stand for its name."""
 
 
 @settings(max_examples=30, deadline=None)
@@ -63,7 +63,7 @@ PARTS = (
 def test_channels_that_are_last_between_other_layers_become_first(
     parts: list[str], image_last: bool
 ) -> None:
-    """Linear layers of torch stand so in a network, and the scaling of an image by Keras."""
+    """Torch's linear layers are exported like this, and so is Keras's scaling of an image."""
     to_first = "Transpose<perm=[0,3,1,2]>"
     to_last = "Transpose<perm=[0,2,3,1]>"
     tensors = ["u", *(f"t{k}" for k in range(1, len(parts) + 1))]
@@ -71,7 +71,7 @@ def test_channels_that_are_last_between_other_layers_become_first(
         f"{to} = {part.format(x)}" for part, (x, to) in zip(parts, pairwise(tensors), strict=True)
     )
     channels = CHANNELS * (1 + any("Concat" in part for part in parts))
-    # Sizes and channels have to fit what is behind.
+    # Sizes and channels have to fit the layers behind.
     assume(not any("Concat" in part for part in parts[:-1]))
     is_sized = any(part.startswith(("Pad", "Reduce")) for part in parts)
     assume(channels == CHANNELS or not is_sized)
@@ -80,7 +80,7 @@ def test_channels_that_are_last_between_other_layers_become_first(
     if image_last:
         first = "u = Identity(x)"
         sizes = f"[N,H,W,{CHANNELS}]"
-    model = made(
+    model = network_from(
         f"{first} {inner} v = {to_first}({tensors[-1]}) y = Conv(v, end)",
         ends=f"float{sizes} x => float[N,1,H2,W2] y",
         image_last=np.linspace(0.5, 1, CHANNELS),
@@ -98,7 +98,7 @@ def test_channels_that_are_last_between_other_layers_become_first(
     ("axes", "pads"), [([1], [1, 2]), ([-2, -3], [0, 1, 2, 0]), ([2, 1, 0, 3], [1, 2, *[0] * 6])]
 )
 def test_pads_of_channels_last_may_name_their_axes(axes: list[int], pads: list[int]) -> None:
-    model = made(
+    model = network_from(
         "u = Transpose<perm=[0,2,3,1]>(x) p = Pad(u, pads, , axes) "
         "v = Transpose<perm=[0,3,1,2]>(p) y = Conv(v, end)",
         opset=18,
@@ -108,7 +108,8 @@ def test_pads_of_channels_last_may_name_their_axes(axes: list[int], pads: list[i
     )
     short = simplify(model, "a.onnx")
     assert "Transpose" not in {n.op_type for n in short.graph.node}
-    # onnxruntime moves such a Transpose itself, and leaves the axes as they were.
+    # onnxruntime moves such a Transpose and leaves the axes as they were, which is wrong, so that
+    # ONNX's reference gives the expected result.
     (before,) = ReferenceEvaluator(model).run(None, {"x": IMAGE})
     np.testing.assert_allclose(result_of(open_session(short), IMAGE), np.asarray(before), rtol=1e-4)
 
@@ -117,7 +118,7 @@ def test_pads_that_follow_from_an_even_size_are_stated() -> None:
     """TensorFlow pads strided layers of images of any size at their end."""
     where = 'coordinate_transformation_mode="asymmetric", nearest_mode="floor"'
     same = 'auto_pad="SAME_UPPER", strides=[2,2]'
-    model = made(
+    model = network_from(
         f"""c = Conv<{same}>(x, w) m = MaxPool<{same}, kernel_shape=[3,3]>(c)
         y = Resize<{where}>(m, , fourfold)""",
         fourfold=[1.0, 1.0, 4.0, 4.0],
@@ -132,9 +133,9 @@ def test_pads_that_follow_from_an_even_size_are_stated() -> None:
 @pytest.mark.parametrize("layers", [1, 2, 5])
 @pytest.mark.parametrize("is_fixed", [False, True])
 def test_the_image_of_a_network_without_padding_is_mirrored(layers: int, is_fixed: bool) -> None:
-    """Inside the border it computes what it computed before, at a fixed size as at any."""
+    """Inside the border the result stays the same, for a fixed size and for any size."""
     tensors = ["x", *(f"c{k}" for k in range(1, layers)), "y"]
-    model = made(" ".join(f"{to} = Conv({source}, w)" for source, to in pairwise(tensors)))
+    model = network_from(" ".join(f"{to} = Conv({source}, w)" for source, to in pairwise(tensors)))
     if is_fixed:
         model = sized(model, *IMAGE.shape[2:])
     short = simplify(model, "a.onnx")
@@ -149,7 +150,7 @@ def test_the_image_of_a_network_without_padding_is_mirrored(layers: int, is_fixe
 def test_a_network_that_pools_over_the_image_gets_no_border() -> None:
     """A larger image would change the mean, and with it the result inside the border."""
     nodes = "c = Conv(x, w) pooled = GlobalAveragePool(c) y = Mul(c, pooled)"
-    model = sized(made(nodes), *IMAGE.shape[2:])
+    model = sized(network_from(nodes), *IMAGE.shape[2:])
     short = simplify(model, "a.onnx")
     assert "Pad" not in {n.op_type for n in short.graph.node}
     before, after = (result_of(open_session(each), IMAGE) for each in (model, short))
@@ -158,7 +159,7 @@ def test_a_network_that_pools_over_the_image_gets_no_border() -> None:
 
 def test_layers_with_and_without_padding_together_are_refused() -> None:
     """Zeros that a layer pads with would lie beyond a mirrored border."""
-    model = made(f"{CONV} y = Conv(c, w)")
+    model = network_from(f"{CONV} y = Conv(c, w)")
     short = simplify(model, "a.onnx")
     assert [n.op_type for n in short.graph.node] == ["Conv", "Conv"]
     reason = refusal(short)
@@ -171,7 +172,7 @@ def test_slices_side_by_side_are_a_pixel_unshuffle() -> None:
     cuts = [f"cut_{name} = Slice(x, {name}, far, axes, by_two)" for name in starts]
     joined = f"j = Concat<axis=1>({', '.join(f'cut_{name}' for name in starts)})"
     weight = np.random.default_rng(0).normal(0, 1, (3, 4 * CHANNELS, 3, 3))
-    model = made(
+    model = network_from(
         f"{' '.join(cuts)} {joined} y = {SAME}(j, focus)",
         far=[999, 999],
         by_two=[2, 2],

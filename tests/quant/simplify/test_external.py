@@ -1,6 +1,4 @@
-"""Weights in a file beside the model: taken in from the model's own folder, and
-from nowhere else.
-"""
+"""Tests that external weights are read from the model's own folder, and from nowhere else."""
 
 import os
 from collections.abc import Callable
@@ -24,7 +22,7 @@ Damage = Callable[[onnx.ModelProto], object]
 
 @pytest.fixture
 def saved(tmp_path: Path) -> Path:
-    """A network whose weights lie in `model/weights.bin` beside it."""
+    """Write a network whose weights are in `model/weights.bin` next to it, and return its path."""
     model = onnx.load_model(float_convbeers(tmp_path / "whole.onnx", 1, 4))
     rng = np.random.default_rng(0)
     for tensor in model.graph.initializer:
@@ -61,7 +59,7 @@ def stating(key: str, value: str) -> Damage:
     return change
 
 
-def test_the_same_network_apart_and_whole_computes_the_same(saved: Path) -> None:
+def test_a_network_in_one_file_and_in_two_computes_the_same(saved: Path) -> None:
     one_file = load_onnx(saved.parents[1] / "whole.onnx")
     two_files = load_onnx(saved)
     assert two_files.graph.initializer == one_file.graph.initializer
@@ -128,19 +126,19 @@ def test_no_pipe_is_waited_for(saved: Path) -> None:
         ),
     ],
 )
-def test_what_the_model_states_of_its_weights_is_looked_at(
+def test_what_the_model_states_about_its_weights_is_checked(
     damage: Damage, words: str, saved: Path
 ) -> None:
     assert words in refused(rewritten(saved, damage))
 
 
-def test_weights_that_are_not_finite_are_refused_there_too(saved: Path) -> None:
+def test_external_weights_that_are_not_finite_are_refused(saved: Path) -> None:
     weights = saved.parent / "weights.bin"
     weights.write_bytes(b"\xff" * weights.stat().st_size)
     assert "NaN or infinite" in refused(saved)
 
 
-def test_constants_of_nodes_are_not_looked_for(saved: Path) -> None:
+def test_external_constants_of_nodes_are_refused(saved: Path) -> None:
     def change(model: onnx.ModelProto) -> None:
         tensor = TensorProto(name="apart", data_type=TensorProto.FLOAT, dims=[1])
         tensor.data_location = TensorProto.EXTERNAL
@@ -150,7 +148,7 @@ def test_constants_of_nodes_are_not_looked_for(saved: Path) -> None:
     assert "another file" in refused(rewritten(saved, change))
 
 
-def test_a_digest_tells_networks_apart_that_differ_in_the_file_beside_alone(saved: Path) -> None:
+def test_a_digest_covers_external_weights(saved: Path) -> None:
     before = network_sha256(saved)
     own = sha256(saved)
     assert before != own

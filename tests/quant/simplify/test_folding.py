@@ -1,6 +1,4 @@
-"""What exporters leave is folded: the same results from a short list of operators, whatever the
-spelling.
-"""
+"""Tests that exporters' operators are folded into a short list without changing the results."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -22,12 +20,12 @@ from beers_deploy.quant.domains import OPSET
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.session import open_session, tensors_of
 from beers_deploy.quant.simplify.simplify import simplify
-from tests.quant.simplify.networks import CASES, CHANNELS, CONV, NORMAL, SAME, made
+from tests.quant.simplify.networks import CASES, CHANNELS, CONV, NORMAL, SAME, network_from
 from tests.shipped import shipped_pair
 
 
 def results(model: onnx.ModelProto, names: Sequence[str] | None = None) -> list[np.ndarray]:
-    """Of an image of odd size, the runtime's own optimisation off."""
+    """Return a network's results for an image of odd size, without the runtime's optimisations."""
     image = np.random.default_rng(5).uniform(-1, 1, (2, CHANNELS, 9, 11)).astype(np.float32)
     return tensors_of(open_session(model, 1, optimise=False), list(names) if names else None, image)
 
@@ -37,9 +35,7 @@ def kinds(model: onnx.ModelProto) -> dict[str, int]:
 
 
 def folded(model: onnx.ModelProto, atol: float = 2e-5) -> dict[str, int]:
-    """The kinds of nodes that are left, once it is seen that the results are the same and the
-    network sound.
-    """
+    """Simplify a network, check its validity and results, and count its operators by kind."""
     short = simplify(model, "a.onnx")
     onnx.checker.check_model(short)
     for before, after in zip(results(model), results(short), strict=True):
@@ -49,9 +45,9 @@ def folded(model: onnx.ModelProto, atol: float = 2e-5) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_what_exporters_leave_is_folded_and_computes_the_same(case: str) -> None:
+def test_operators_of_exporters_are_folded_and_compute_the_same(case: str) -> None:
     nodes, remaining = CASES[case]
-    assert folded(made(nodes)) == remaining
+    assert folded(network_from(nodes)) == remaining
 
 
 CONVOLUTIONS = {"Conv", "ConvTranspose"}
@@ -69,22 +65,24 @@ PARTS = {
     "Relu": "Relu({})",
     **{kind: f"{kind}({{}}, image)" for kind in ("Add", "Sub", "Mul", "Div")},
 }
-"""Operators on a tensor that stands in the place of the braces."""
+"""Operators on one tensor; the braces stand for its name."""
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.sampled_from(sorted(PARTS)), min_size=2, max_size=4))
-def test_what_works_on_each_channel_is_folded_into_convolutions(parts: list[str]) -> None:
+def test_channelwise_operators_are_folded_into_convolutions(parts: list[str]) -> None:
     tensors = ["x", *(f"t{k}" for k in range(1, len(parts))), "y"]
     nodes = [
         f"{to} = {PARTS[part].format(x)}"
         for part, (x, to) in zip(parts, pairwise(tensors), strict=True)
     ]
-    model = made(" ".join(nodes), pairs=np.random.default_rng(2).normal(0, 0.5, (4, 2, 3, 3)))
+    model = network_from(
+        " ".join(nodes), pairs=np.random.default_rng(2).normal(0, 0.5, (4, 2, 3, 3))
+    )
     short = simplify(model, "a.onnx")
     (before,) = results(model)
     (after,) = results(short)
-    # What no padding keeps is mirrored.
+    # A network without padding gets a mirrored border, which is cut off here.
     border_px = max((after.shape[2] - before.shape[2]) // 2, 0)
     after = after[:, :, border_px : after.shape[2] - border_px, border_px:]
     after = after[..., : before.shape[3]]
@@ -96,13 +94,13 @@ def test_what_works_on_each_channel_is_folded_into_convolutions(parts: list[str]
     for n in short.graph.node:
         sources = CONVOLUTIONS.intersection(kind.get(name, "") for name in n.input)
         assert not sources or n.op_type in {"Clip", "Min", "Relu", *CONVOLUTIONS}
-        # A shift stays in front of zeros that a convolution pads with, a factor does not.
+        # An offset cannot pass zero padding, so it stays in front of it. A factor can.
         is_scaled = n.op_type in CONVOLUTIONS and kind.get(n.input[0]) in ("Mul", "Div")
         assert not is_scaled
 
 
-def test_numbers_shared_by_two_convolutions_are_folded_into_one_of_them() -> None:
-    short = simplify(made(f"{CONV} n {NORMAL} r = Relu(n) y = {SAME}(r, w)"), "a.onnx")
+def test_shared_weights_are_folded_for_one_convolution_alone() -> None:
+    short = simplify(network_from(f"{CONV} n {NORMAL} r = Relu(n) y = {SAME}(r, w)"), "a.onnx")
     first, second = (n.input[1] for n in short.graph.node if n.op_type == "Conv")
     assert first != second == "w"
 
@@ -116,7 +114,7 @@ def test_operators_of_other_opsets_become_ours(opset: int) -> None:
     if not newer:
         enlarged = 'Upsample<mode="linear">(c, twice)'
         clip = "Clip<min=0.0, max=6.0>(e)"
-    model = made(f"{CONV} e = {enlarged} y = {clip}", opset)
+    model = network_from(f"{CONV} e = {enlarged} y = {clip}", opset)
     short = simplify(model, "a.onnx")
     assert [(o.domain, o.version) for o in short.opset_import] == [("", OPSET)]
     assert folded(model) == {"Conv": 1, "Resize": 1, "Clip": 1}
@@ -124,23 +122,23 @@ def test_operators_of_other_opsets_become_ours(opset: int) -> None:
 
 
 def test_an_operator_that_our_opset_lacks_stays_of_its_own() -> None:
-    short = simplify(made(f"{CONV} n {NORMAL} y = Gelu(n)", 20), "a.onnx")
+    short = simplify(network_from(f"{CONV} n {NORMAL} y = Gelu(n)", 20), "a.onnx")
     assert kinds(short) == {"Conv": 1, "Gelu": 1}
     assert short.opset_import[0].version == 20
 
 
 @pytest.mark.parametrize("kind", ["float16", "bfloat16", "double"])
 def test_weights_of_other_floats_become_float32(kind: str) -> None:
-    model = made(f"{CONV} n {NORMAL} y = Relu(n)", kind=kind)
+    model = network_from(f"{CONV} n {NORMAL} y = Relu(n)", kind=kind)
     short = simplify(model, "a.onnx")
     assert {t.data_type for t in short.graph.initializer} == {TensorProto.FLOAT}
     assert short.graph.input[0].type.tensor_type.elem_type == TensorProto.FLOAT
     assert np.abs(results(short)[0]).max() > 0.1
 
 
-def test_names_and_what_is_said_of_a_network_stay() -> None:
+def test_names_and_metadata_of_a_network_stay() -> None:
     ends = "float[N,4,H,W] x => float[N,4,H,W] y, float[N,4,H,W] z"
-    model = made(f"{CONV} i = Identity(c) y = Relu(i) z = {SAME}(c, w)", ends=ends)
+    model = network_from(f"{CONV} i = Identity(c) y = Relu(i) z = {SAME}(c, w)", ends=ends)
     # A node without a name would get the name of its output, if another node did not have it.
     model.graph.node[0].name = ""
     model.graph.node[2].name = "c"
@@ -154,7 +152,7 @@ def test_names_and_what_is_said_of_a_network_stay() -> None:
 
 
 def test_weights_that_are_inputs_too_are_weights() -> None:
-    model = made(f"{CONV} y {NORMAL}")
+    model = network_from(f"{CONV} y {NORMAL}")
     model.graph.input.extend(
         helper.make_tensor_value_info(t.name, t.data_type, t.dims) for t in model.graph.initializer
     )
@@ -164,7 +162,9 @@ def test_weights_that_are_inputs_too_are_weights() -> None:
 
 
 def test_the_same_file_gives_the_same_bytes_and_is_not_changed() -> None:
-    model = made(f"v = Identity(w) c = {SAME}(x, v) n {NORMAL} d = {SAME}(n, w) y = Sub(x, d)")
+    model = network_from(
+        f"v = Identity(w) c = {SAME}(x, v) n {NORMAL} d = {SAME}(n, w) y = Sub(x, d)"
+    )
     before = model.SerializeToString()
     short = simplify(model, "a.onnx")
     assert short.SerializeToString() == simplify(model, "b.onnx").SerializeToString()
@@ -180,15 +180,15 @@ def test_files_that_need_nothing_stay_as_they_are(tmp_path: Path) -> None:
         assert load_onnx(path).SerializeToString() == path.read_bytes()
 
 
-def test_a_network_that_the_runtime_does_not_read_is_one_sentence() -> None:
-    model = made(f"c = Conv(x, b) y {NORMAL}")
+def test_a_network_that_the_runtime_cannot_run_is_refused_in_one_sentence() -> None:
+    model = network_from(f"c = Conv(x, b) y {NORMAL}")
     with pytest.raises(ModelError, match=r"onnxruntime cannot run a\.onnx"):
         simplify(model, "a.onnx")
 
 
-def test_sizes_that_contradict_the_nodes_are_one_sentence_or_read() -> None:
-    """Found by the fuzzer: onnx's converter raises an error of its own class."""
-    model = made("m = Sub(x, image) y = Conv(m, w)", 9)
+def test_sizes_that_contradict_the_nodes_raise_no_foreign_error() -> None:
+    """The fuzzer found that onnx's converter raises an error of its own class."""
+    model = network_from("m = Sub(x, image) y = Conv(m, w)", 9)
     del model.graph.output[0].type.tensor_type.shape.dim[3]
     try:
         assert "Conv" in kinds(simplify(model, "a.onnx"))
@@ -200,9 +200,9 @@ def test_sizes_that_contradict_the_nodes_are_one_sentence_or_read() -> None:
 @pytest.mark.parametrize(
     "front", ["f = Cast<to=1>(x)", "t = Transpose<perm=[0,1,2,3]>(x) f = Cast<to=1>(t)"]
 )
-def test_an_image_of_integers_is_one_of_floats(front: str, kind: str) -> None:
+def test_an_integer_image_input_becomes_float(front: str, kind: str) -> None:
     ends = f"{kind}[N,{CHANNELS},H,W] x => float[N,C,H2,W2] y"
-    model = made(f"{front} d = Div(f, six) y = {SAME}(d, w)", ends=ends)
+    model = network_from(f"{front} d = Div(f, six) y = {SAME}(d, w)", ends=ends)
     short = simplify(model, "a.onnx")
     assert "Cast" not in kinds(short)
     image = np.random.default_rng(0).integers(0, 255, (1, CHANNELS, 9, 11))

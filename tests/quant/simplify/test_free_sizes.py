@@ -1,4 +1,4 @@
-"""Networks that compute with the size of their image are the same without that arithmetic."""
+"""Tests that arithmetic on the image size is removed without changing the results."""
 
 import io
 import warnings
@@ -22,7 +22,7 @@ FEATURES = 4
 
 
 class PaddedUNet(nn.Module):
-    """Pads what it enlarged to the size of the skip, as the most copied U-Net does."""
+    """A U-Net that pads enlarged features to the size of the skip, as the most copied one does."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -40,7 +40,7 @@ class PaddedUNet(nn.Module):
         return functional.pad(up, sides)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Images (N, 1, H, W) to the same."""
+        """Map images (N, 1, H, W) to the same shape."""
         fine = torch.relu(self.fine(image))
         deep = torch.relu(self.deep(functional.max_pool2d(fine, 2)))
         result: Tensor = self.tail(torch.cat([self.enlarged(deep, fine), fine], 1))
@@ -48,19 +48,19 @@ class PaddedUNet(nn.Module):
 
 
 class ResizedUNet(PaddedUNet):
-    """Enlarges to the size of the skip, and clips."""
+    """A U-Net that resizes features to the size of the skip, and clips its result."""
 
     def enlarged(self, deep: Tensor, fine: Tensor) -> Tensor:
         """Return deep features at the size of fine ones, (1, F, H, W)."""
         return functional.interpolate(deep, size=fine.shape[2:], mode="bilinear")
 
     def forward(self, image: Tensor) -> Tensor:
-        """Images (N, 1, H, W) to the same."""
+        """Map images (N, 1, H, W) to the same shape."""
         return torch.clamp(image + super().forward(image), 0, 1)
 
 
 class Gated(nn.Module):
-    """NAFNet's gate: half of the channels times the other half."""
+    """A network with NAFNet's gate: half of the channels times the other half."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -69,16 +69,14 @@ class Gated(nn.Module):
         self.tail = nn.Conv2d(FEATURES, 1, 1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Images (N, 1, H, W) to the same."""
+        """Map images (N, 1, H, W) to the same shape."""
         first, second = self.deep(self.wide(image)).chunk(2, 1)
         correction: Tensor = self.tail(first * second)
         return image + correction
 
 
 class Shuffled(Gated):
-    """ShuffleNet's shuffle of channels, ESPCN's pixel unshuffle within, and a gate of one channel
-    that is expanded.
-    """
+    """A network with ShuffleNet's channel shuffle, a pixel unshuffle, and an expanded gate."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -86,7 +84,7 @@ class Shuffled(Gated):
         self.tail = nn.Conv2d(8 * FEATURES, 4, 1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Images (N, 1, H, W) to the same."""
+        """Map images (N, 1, H, W) to the same shape."""
         wide: Tensor = self.wide(image)
         count, channels, rows, columns = wide.shape
         pairs = wide.reshape(count, 2, channels // 2, rows, columns).transpose(1, 2)
@@ -97,16 +95,14 @@ class Shuffled(Gated):
 
 
 class Repeated(Shuffled):
-    """Repeats channels and pixels one by one, shrinks to a size, and unshuffles in another
-    order.
-    """
+    """A network that repeats channels and pixels, resizes, and unshuffles in another order."""
 
     def __init__(self) -> None:
         super().__init__()
         self.tail = nn.Conv2d(2 * FEATURES * 7, 1, 1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Images (N, 1, H, W) to the same."""
+        """Map images (N, 1, H, W) to the same shape."""
         wide: Tensor = self.wide(image)
         count, channels, rows, columns = wide.shape
         sides = (rows // 2, columns // 2)
@@ -122,7 +118,7 @@ class Repeated(Shuffled):
 
 
 class NoiseLevel(nn.Module):
-    """FFDNet's map of one noise level, as a constant."""
+    """A network with FFDNet's map of one constant noise level."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -130,7 +126,7 @@ class NoiseLevel(nn.Module):
         self.tail = nn.Conv2d(FEATURES, 1, 3, padding=1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Images (N, 1, H, W) to the same."""
+        """Map images (N, 1, H, W) to the same shape."""
         level = torch.full((1, 1, 1, 1), 0.1)
         level = level.expand(1, 1, image.shape[2], image.shape[3])
         result: Tensor = self.tail(torch.relu(self.head(torch.cat([image, level], 1))))
@@ -138,7 +134,7 @@ class NoiseLevel(nn.Module):
 
 
 class UnshuffledNoiseLevel(NoiseLevel):
-    """FFDNet whole: on pixels that are unshuffled, the level being repeated over them."""
+    """All of FFDNet: it reads unshuffled pixels, and a noise level that is repeated over them."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -146,7 +142,7 @@ class UnshuffledNoiseLevel(NoiseLevel):
         self.tail = nn.Conv2d(FEATURES, 4, 3, padding=1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Images (N, 1, H, W) to the same."""
+        """Map images (N, 1, H, W) to the same shape."""
         blocks = functional.pixel_unshuffle(image, 2)
         level = torch.full((1, 1, 1, 1), 0.1).repeat(1, 1, blocks.shape[2], blocks.shape[3])
         result = self.tail(torch.relu(self.head(torch.cat([blocks, level], 1))))
@@ -154,7 +150,7 @@ class UnshuffledNoiseLevel(NoiseLevel):
 
 
 def exported(module: nn.Module) -> onnx.ModelProto:
-    """Export a module with drawn weights, its height and width free."""
+    """Export a module with random weights, for any height and width."""
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
         for numbers in module.parameters():
@@ -174,7 +170,7 @@ def exported(module: nn.Module) -> onnx.ModelProto:
     "make", [PaddedUNet, ResizedUNet, Gated, Shuffled, Repeated, NoiseLevel, UnshuffledNoiseLevel]
 )
 def test_sizes_are_gone_and_results_are_the_same(make: Callable[[], nn.Module]) -> None:
-    """Also for sides that are no multiples of 64, as far as the network halves them evenly."""
+    """Sides need not be multiples of 64, if the network halves them evenly."""
     model = exported(make())
     short = simplify(model, "a.onnx")
     left = Counter(node.op_type for node in short.graph.node)
@@ -187,21 +183,21 @@ def test_sizes_are_gone_and_results_are_the_same(make: Callable[[], nn.Module]) 
 
 
 class Enlarged(nn.Module):
-    """Expands the channels of its result, of both factors, and of what is a result too."""
+    """A network that expands two factors and its result, the last without an effect."""
 
     def __init__(self) -> None:
         super().__init__()
         self.body = nn.Conv2d(1, 1, 3, padding=1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Images (N, 1, H, W) to (N, 3, H, W)."""
+        """Map images (N, 1, H, W) to (N, 3, H, W)."""
         wide = self.body(image).expand(-1, 3, -1, -1)
         result: Tensor = wide * (1 - self.body(wide[:, :1])).expand_as(wide)
         return result.expand(image.shape[0], 3, image.shape[2], image.shape[3])
 
 
 class Selected(nn.Module):
-    """Reverses channels, and scales them by their mean over the image."""
+    """A network that reorders channels, and scales them by their mean over the image."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -209,7 +205,7 @@ class Selected(nn.Module):
         self.tail = nn.Conv2d(FEATURES, 1, 3, padding=1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Images (1, 1, H, W) to the same."""
+        """Map images (1, 1, H, W) to the same shape."""
         wide: Tensor = self.wide(image)[:, [3, 1, 0, 2]]
         mean = functional.interpolate(wide.mean((2, 3), keepdim=True), wide.shape[2:])
         result: Tensor = self.tail(wide * mean)
@@ -240,16 +236,16 @@ def test_an_expand_that_has_an_effect_keeps_it() -> None:
 
 
 class Cropped(nn.Module):
-    """Uses a tenth of its rows more than once, whatever their number."""
+    """A network that appends the first tenth of its rows again, whatever their number."""
 
     def forward(self, image: Tensor) -> Tensor:
-        """Images (N, 1, H, W) to the same."""
+        """Map images (N, 1, H, W) to (N, 1, H + H // 10, W)."""
         rows = image.shape[2] // 10
         return torch.cat([image, image[:, :, :rows]], 2)
 
 
-def test_what_depends_on_the_size_stays_and_is_refused() -> None:
-    """The reason says what to do about it."""
+def test_arithmetic_that_depends_on_the_size_stays_and_is_refused() -> None:
+    """The refusal says what to do."""
     model = simplify(exported(Cropped()), "a.onnx")
     assert any(node.op_type == "Shape" for node in model.graph.node)
     assert "Export it with fixed height and width" in refusal(model)

@@ -1,6 +1,4 @@
-"""What stops other readers: each file is read right, or refused by one sentence that names the
-node.
-"""
+"""Tests that unusual files are read correctly, or refused in a sentence that names the node."""
 
 from pathlib import Path
 
@@ -17,7 +15,7 @@ from beers_deploy.dpu.reading import read_network
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session, tensors_of
-from tests.quant.simplify.networks import CONV, NORMAL, made
+from tests.quant.simplify.networks import CONV, NORMAL, network_from
 
 LIGHT = sorted((Path(onnx.__file__).parent / "backend" / "test" / "data" / "light").glob("*.onnx"))
 SMALL = [path for path in LIGHT if path.stem.removeprefix("light_") in ("shufflenet", "squeezenet")]
@@ -41,16 +39,16 @@ CHOICE = """m = ReduceMax<keepdims=0>(x)
 
 def foreign() -> onnx.ModelProto:
     """Return a network with an operator of an unknown domain."""
-    model = made("y = org.elsewhere.Mystery(x)")
+    model = network_from("y = org.elsewhere.Mystery(x)")
     model.opset_import.append(helper.make_opsetid("org.elsewhere", 1))
     return model
 
 
 @pytest.mark.parametrize(
     ("model", "words"),
-    [(made(CHOICE), "If f in .* contains a graph"), (foreign(), "Mystery y of")],
+    [(network_from(CHOICE), "If f in .* contains a graph"), (foreign(), "Mystery y of")],
 )
-def test_what_no_runtime_may_open_is_named_and_may_be_inspected(
+def test_a_file_that_no_runtime_may_open_is_refused_and_can_be_inspected(
     model: onnx.ModelProto, words: str, tmp_path: Path
 ) -> None:
     path = saved(model, tmp_path)
@@ -65,7 +63,7 @@ def test_what_no_runtime_may_open_is_named_and_may_be_inspected(
 
 @pytest.mark.parametrize("batch", ["N", 1, 3])
 def test_any_batch_is_read(batch: str | int, tmp_path: Path) -> None:
-    model = made(f"{CONV} n {NORMAL} y = Relu(n)")
+    model = network_from(f"{CONV} n {NORMAL} y = Relu(n)")
     first = model.graph.input[0].type.tensor_type.shape.dim[0]
     first.CopyFrom(onnx.TensorShapeProto.Dimension())
     setattr(first, "dim_param" if isinstance(batch, str) else "dim_value", batch)
@@ -81,8 +79,9 @@ def test_any_batch_is_read(batch: str | int, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("path", SMALL, ids=lambda path: path.stem)
 def test_known_architectures_are_read_and_judged(path: Path) -> None:
-    """Of opset 9, weights filled by nodes: the smaller of the nine that onnx brings, the others as
-    these.
+    """These are the smaller of onnx's nine light models: opset 9, weights filled by nodes.
+
+    The others behave the same.
     """
     result = CliRunner().invoke(app, ["check", str(path), "--tile", "224"])
     assert result.exit_code in (0, 1)

@@ -6,7 +6,7 @@ import pytest
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import load_onnx
-from tests.quant.simplify.networks import CONV, made
+from tests.quant.simplify.networks import CONV, network_from
 
 DROPOUT = "d = Dropout(c, half, mode)"
 NORMAL = "BatchNormalization{}(c, gain, offset, mean, variance)"
@@ -31,7 +31,7 @@ INFERENCE = {
 def saved(nodes: str, opset: int, folder: Path) -> Path:
     """Write a network with nodes between a convolution and a ReLU."""
     path = folder / "network.onnx"
-    path.write_bytes(made(f"{CONV} {nodes} y = Relu(d)", opset).SerializeToString())
+    path.write_bytes(network_from(f"{CONV} {nodes} y = Relu(d)", opset).SerializeToString())
     return path
 
 

@@ -17,7 +17,7 @@ from beers_deploy.quant.simplify.large_kernels import (
 )
 from beers_deploy.quant.simplify.simplify import simplify
 from tests.quant.quick import copied
-from tests.quant.simplify.networks import made
+from tests.quant.simplify.networks import network_from
 
 CHANNELS = 3
 ENDS = f"float[N,{CHANNELS},H,W] x => float[N,C,h,w] y"
@@ -74,7 +74,7 @@ def test_a_large_kernel_is_several_small_ones_and_their_sum(
     weight = drawn(generator, outputs, CHANNELS // groups, *kernel)
     bias = drawn(generator, outputs)
     window = f"pads={pads}, strides={list(strides)}, dilations={list(dilations)}, group={groups}"
-    model = made(f"y = Conv<{window}>(x, w, b)", ends=ENDS, w=weight, b=bias)
+    model = network_from(f"y = Conv<{window}>(x, w, b)", ends=ENDS, w=weight, b=bias)
     # The pass alone, because `simplify` extends a network without padding by a border.
     short = copied(model)
     graph = OnnxGraph(short)
@@ -97,7 +97,7 @@ def test_srresnets_kernels_of_9_x_9_are_two_and_a_sum() -> None:
     The last one keeps the name of the layer and has its ReLU, so that reports name what users know.
     """
     weight = drawn(np.random.default_rng(0), CHANNELS, CHANNELS, 9, 9)
-    model = made("[head] c = Conv<pads=[4,4,4,4]>(x, w) y = Relu(c)", ends=ENDS, w=weight)
+    model = network_from("[head] c = Conv<pads=[4,4,4,4]>(x, w) y = Relu(c)", ends=ENDS, w=weight)
     short = simplify(model, "a.onnx")
     names = [op.name for op in read_network(short).graph]
     assert names == ["head.rows_0", "head.rows_1", "head.rows", "head"]
@@ -123,7 +123,7 @@ def test_a_crop_is_a_convolution_that_reads_one_pixel(
     places = np.array(list(cut.values()))
     constants: dict[str, Any] = {"w": weight, "starts": places, "stops": -places, "axes": list(cut)}
     nodes = f"s = Slice(x, starts, stops, axes) y = Conv<pads={[pad] * 4}>(s, w)"
-    model = made(nodes, ends=ENDS, **constants)
+    model = network_from(nodes, ends=ENDS, **constants)
     short = simplify(model, "a.onnx")
     kinds = [node.op_type for node in short.graph.node]
     assert "Slice" not in kinds
@@ -153,7 +153,7 @@ def test_a_u_net_without_padding_crops_its_skip_and_gets_a_mirrored_border() -> 
         e = Add(s, d)
         y = Conv(e, w)
     """
-    model = made(nodes, ends=ENDS, **constants)
+    model = network_from(nodes, ends=ENDS, **constants)
     short = simplify(model, "a.onnx")
     assert refusal(short) == ""
     assert read_network(short).border_px == 6
