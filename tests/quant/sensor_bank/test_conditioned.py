@@ -1,6 +1,4 @@
-"""INT8 once for a conditioned of sensors: near the float network for each, and alike but for what a
-sensor changes.
-"""
+"""Tests of the INT8 network that is quantised once and conditioned on each sensor."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -85,7 +83,7 @@ def core_of(conditioned: ConditionedCore, vector: tuple[float, ...]) -> IntCore:
 
 
 def file_of(conditioned: ConditionedCore, vector: tuple[float, ...]) -> onnx.ModelProto:
-    """Return the file of a sensor, which is named by its vector."""
+    """Return the INT8 file of a sensor, named by its vector."""
     about = {SENSOR_BIASES: conditioned.biases_to_json(), "sensor": str(vector)}
     return host_model(core_of(conditioned, vector), about)
 
@@ -121,9 +119,7 @@ def test_int8_is_near_the_float_network_for_every_sensor(
 def test_points_and_saturated_edges_are_corrected_as_far_as_in_float(
     pair: Pair, vector: tuple[float, ...]
 ) -> None:
-    """Also where the fine copies of the analytic restoration end, which they do behind blurred
-    sensors.
-    """
+    """At blurred sensors this holds although the analytic restoration's fine copies saturate."""
     float_network, conditioned = pair
     image = np.full((1, 1, 46, 58), 0.1, np.float32)
     image[..., 10:30, 20:40] = 1.0
@@ -139,7 +135,7 @@ def test_points_and_saturated_edges_are_corrected_as_far_as_in_float(
 
 
 @pytest.mark.parametrize("vector", SENSORS)
-def test_a_float_network_rounded_as_its_file_errs_as_that_does(
+def test_a_float_network_with_the_rounding_of_its_file_errs_as_the_file_does(
     pair: Pair, vector: tuple[float, ...]
 ) -> None:
     float_network, conditioned = pair
@@ -159,7 +155,7 @@ def test_a_float_network_rounded_as_its_file_errs_as_that_does(
     assert 0.4 < ratio < 1.1
 
 
-def test_the_steps_of_maps_turn_float_weights_into_the_files(
+def test_the_steps_of_maps_turn_float_weights_into_those_of_the_file(
     pair: Pair,
 ) -> None:
     float_network, conditioned = pair
@@ -181,7 +177,7 @@ def test_the_steps_of_maps_turn_float_weights_into_the_files(
         assert np.sqrt(np.square(op.weight - expected).mean()) < 1
 
 
-def test_the_file_is_what_its_integers_ask_for_and_the_reference_gives_the_same(
+def test_the_file_matches_its_integers_and_the_reference(
     pair: Pair,
 ) -> None:
     core = core_of(pair[1], SENSORS[0])
@@ -204,20 +200,23 @@ def test_a_sensor_changes_the_first_layer_biases_and_the_unit_alone(
     for one, other in zip(first.ops, second.ops, strict=True):
         if isinstance(one, IntConv) and isinstance(other, IntConv):
             assert np.array_equal(one.weight, other.weight) == (one.name != "bank")
-            conditioned = replace(one, weight=other.weight, weight_frac_bits=other.weight_frac_bits)
+            reweighted = replace(one, weight=other.weight, weight_frac_bits=other.weight_frac_bits)
             assert (
-                replace(conditioned, bias=other.bias, bias_frac_bits=other.bias_frac_bits) == other
+                replace(reweighted, bias=other.bias, bias_frac_bits=other.bias_frac_bits) == other
                 or one.name != "bank"
             )
 
 
 @pytest.mark.parametrize("vector", SENSORS)
-def test_a_body_finer_by_its_gain_makes_what_it_makes_at_a_gain_of_one(
+def test_a_body_with_a_gain_computes_the_same_as_with_a_gain_of_one(
     pair: Pair,
     vector: tuple[float, ...],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Far from int8's ends, but for rounding: the image, filters and biases agree on the gain."""
+    """Image, filters and biases agree on the gain, so that results differ by rounding alone.
+
+    The image is far from the ends of int8.
+    """
     image = 0.4 + 0.02 * textured(46, 58, 3)
     bank = bank_of_vector(vector)
     own = in_int8(pair[1], vector, image)
@@ -231,9 +230,9 @@ def test_a_body_finer_by_its_gain_makes_what_it_makes_at_a_gain_of_one(
 def test_a_dark_image_that_was_multiplied_is_restored_with_smaller_steps(
     pair: Pair, vector: tuple[float, ...], offset: float
 ) -> None:
-    """Multiplied by 2, the error of INT8 falls by at least a quarter, except at the image's border.
+    """The error of INT8 falls by at least a quarter if the image is doubled, except at its border.
 
-    There, the network reads zeros, which stand for another brightness than in float.
+    There the network reads zeros, which stand for another brightness than in float.
     """
     float_network, conditioned = pair
     image = (offset + 0.05 + 0.02 * textured(46, 58, 3)).astype(np.float32)
@@ -248,7 +247,7 @@ def test_a_dark_image_that_was_multiplied_is_restored_with_smaller_steps(
 
 
 def test_any_sensors_file_becomes_another_to_the_byte(pair: Pair) -> None:
-    """By the biases in its metadata, and by a delta."""
+    """The biases in its metadata suffice for this, and so does a delta."""
     conditioned = pair[1]
     first, second = (file_of(conditioned, vector) for vector in SENSORS[:2])
     stored = required_conditioned_core(first)
@@ -284,7 +283,7 @@ def test_a_delta_does_not_fit_a_network_of_the_same_layers(pair: Pair) -> None:
         with_delta(replace(core, ops=ops), delta)
 
 
-def test_words_of_another_network_are_refused(
+def test_biases_of_another_network_are_refused(
     pair: Pair,
 ) -> None:
     core = core_of(pair[1], SENSORS[0])
@@ -327,7 +326,7 @@ def test_no_image_leaves_the_bounds_that_are_proven(pair: Pair) -> None:
             assert tensors[op.output].max() <= high
 
 
-def test_the_dpu_runs_all_of_it(pair: Pair) -> None:
+def test_the_dpu_runs_every_operation(pair: Pair) -> None:
     core = core_of(pair[1], SENSORS[2])
     assert shift_faults(core) == []
     board = board_model(core, {}, 64)

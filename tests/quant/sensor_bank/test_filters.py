@@ -1,6 +1,4 @@
-"""A sensor's bank in whole numbers: flat ground leaves nothing, and together the copies say what
-the filters do.
-"""
+"""Tests of a sensor's integer filter bank: its response to flat ground, and its copies' mean."""
 
 import numpy as np
 import pytest
@@ -25,21 +23,17 @@ from beers_deploy.quant.sensor_bank.filters import (
 VECTOR = st.tuples(*[st.floats(-1, 1)] * 4)
 
 COARSE = 2 + FILTERS
-"""The kernel of the coarse copy: behind the image's, the planes' and the analytic restoration's."""
+"""The coarse copy's kernel, after those of the image, the planes and the analytic restoration."""
 
 
 def sums(image: np.ndarray, own: Bank) -> np.ndarray:
-    """What the first convolution makes of an image (1, 1, H, W), in steps, before anything is
-    rounded or added.
-    """
+    """Return the first convolution of an image (1, 1, H, W), in steps, before rounding and bias."""
     bank = integer_bank(own, 1, own.gain)
     return convolve(BANK_SLICES.encode(image), bank.weight, Window()) / 2.0**bank.frac_bits
 
 
 def textured(rows: int, columns: int, seed: int = 0) -> np.ndarray:
-    """Ground as a sensor sees it, from a twentieth to nearly all of full scale: (1, 1, rows,
-    columns) float32.
-    """
+    """Return natural ground (1, 1, rows, columns), float32, from 0.05 to 0.95 of full scale."""
     generator = np.random.default_rng(seed)
     fy = np.fft.fftfreq(rows)[:, None]
     fx = np.fft.rfftfreq(columns)[None, :]
@@ -57,7 +51,7 @@ def textured(rows: int, columns: int, seed: int = 0) -> np.ndarray:
 
 @settings(max_examples=15)
 @given(VECTOR, st.integers(0, MAX_DN))
-def test_flat_ground_leaves_nothing_but_its_own_brightness(
+def test_the_response_to_flat_ground_is_its_brightness_alone(
     vector: tuple[float, ...], dn: int
 ) -> None:
     flat = np.full((1, 1, SIDE_PX, SIDE_PX), dn / MAX_DN, np.float32)
@@ -74,7 +68,7 @@ def test_the_weights_are_int8_and_near_the_filters(vector: tuple[float, ...]) ->
     gain = own.gain
     bank = integer_bank(own, 1, gain)
     coarse_pair = bank.weight[:, :2].astype(int)
-    # No finer scale would hold the weights, and none of them is clipped.
+    # The scale is the finest one that clips no weight.
     assert 62 <= np.abs(coarse_pair).max() < 127
     assert np.ptp(coarse_pair, axis=1).max() <= 1
     for channel, (kernel, _) in enumerate(channels()):
@@ -88,10 +82,8 @@ def test_the_weights_are_int8_and_near_the_filters(vector: tuple[float, ...]) ->
 
 @settings(max_examples=8)
 @given(VECTOR)
-def test_the_mean_of_the_copies_is_what_the_filter_gives(vector: tuple[float, ...]) -> None:
-    """To a fraction of a step on ground of all scales, so that rounding the weights costs less than
-    the result's.
-    """
+def test_the_mean_of_the_copies_is_the_result_of_the_filter(vector: tuple[float, ...]) -> None:
+    """The mean errs by a fraction of a step: rounding weights costs less than rounding results."""
     own = bank_of_vector(vector)
     image = textured(90, 101)
     centred = np.lib.stride_tricks.sliding_window_view(
@@ -106,7 +98,7 @@ def test_the_mean_of_the_copies_is_what_the_filter_gives(vector: tuple[float, ..
         assert np.linalg.norm(mean - expected) < most
 
 
-def test_copies_are_rounded_at_places_spread_over_a_step() -> None:
+def test_copies_are_rounded_at_offsets_spread_over_a_step() -> None:
     counts: dict[Kernels, int] = {"cut": COPIES[2], "fitted": COPIES[2] - 1}
     for kernels, count in counts.items():
         offsets = [offset for kernel, offset in channels(kernels) if kernel == 1 + FILTERS]
@@ -115,7 +107,7 @@ def test_copies_are_rounded_at_places_spread_over_a_step() -> None:
         assert sum(offsets) == pytest.approx(0)
 
 
-def test_at_half_resolution_the_same_filters_meet_the_same_pixels() -> None:
+def test_at_half_resolution_the_same_filters_read_the_same_pixels() -> None:
     own = bank_of_vector((0.3, -0.4, 0.1, 0.2))
     image = textured(32, 36)
     fine = integer_bank(own, 1, 1)
@@ -123,7 +115,7 @@ def test_at_half_resolution_the_same_filters_meet_the_same_pixels() -> None:
     assert fine.frac_bits == coarse.frac_bits
     planes = BANK_SLICES.encode(image)
     blocks = planes.reshape(1, 4, 16, 2, 18, 2).transpose(0, 1, 3, 5, 2, 4).reshape(1, 16, 16, 18)
-    # The result is that of places 2 to 13.
+    # The result covers rows 2 to 13 of the 16 rows of blocks.
     actual = convolve(blocks, coarse.weight, Window())
     first = [kernel for kernel, _ in channels()].index(1)
     expected = convolve(planes, fine.weight, Window())[0, first, 1:-1, 1:-1]
