@@ -1,4 +1,4 @@
-"""How tests compile programs in C."""
+"""Compilers and options with which the tests compile C."""
 
 import shutil
 

@@ -46,7 +46,7 @@ Shape = tuple[int, int, int]
 
 
 class CoreDrawer:
-    """Draws operations one by one, each on tensors that are there."""
+    """A builder of a core that draws operations one by one, each on existing tensors."""
 
     def __init__(self, draw: st.DrawFn, tile_px: int) -> None:
         """Begin with planes of a tile, and with a generator for the integers."""
@@ -140,7 +140,7 @@ class CoreDrawer:
         self.append(op, (shape[0], sizes[0], sizes[1]), frac_bits)
 
     def of_kind(self, kind: str) -> None:
-        """Append an operation of a kind, and before it what it needs."""
+        """Append an operation of a kind, after the operations that it needs."""
         getattr(self, f"_{kind.replace(' ', '_')}")(self.tensor())
 
     def _convolution(self, source: str) -> None:
@@ -252,7 +252,7 @@ class CoreDrawer:
         self.append(table, self.shapes[source], self.number(2, 7))
 
     def core(self) -> IntCore:
-        """Return the core, whose last operation is a convolution of what was written last."""
+        """Return the core, which ends in a convolution of the last result."""
         self.convolution(self.ops[-1].output, 2)
         last = self.ops.pop()
         assert isinstance(last, IntConv)
@@ -271,7 +271,7 @@ def cores(draw: st.DrawFn, kinds: tuple[str, ...] = KINDS, most: int = 8) -> tup
     drawer.convolution(PLANES, draw(st.integers(1, 6)))
     for kind in draw(st.lists(st.sampled_from(kinds), min_size=1, max_size=most)):
         drawer.of_kind(kind)
-        # Enlargements in a row would make a test of seconds.
+        # Several enlargements in a row would take seconds.
         if math.prod(drawer.shapes[drawer.ops[-1].output]) > 1 << 14:
             break
     return drawer.core(), tile_px

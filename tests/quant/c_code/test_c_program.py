@@ -1,4 +1,4 @@
-"""A core as C computes the integers of the reference, and any C99 compiler takes it."""
+"""Tests that a core in C computes the reference's integers, with any C99 compiler."""
 
 import re
 from dataclasses import replace
@@ -33,7 +33,7 @@ def assert_equal(core: IntCore, tile_px: int, planes: np.ndarray, compiler: list
 
 
 def extremes(shape: tuple[int, ...]) -> np.ndarray:
-    """Planes (2, P, H, W): int8 values of all sizes, and its ends alone."""
+    """Return planes (2, P, H, W) of random int8 values, and of the two ends of int8 alone."""
     generator = np.random.default_rng(0)
     planes = generator.integers(-128, 128, (2, *shape[1:]))
     planes[1] = generator.choice([-128, 127], shape[1:])
@@ -44,10 +44,10 @@ def extremes(shape: tuple[int, ...]) -> np.ndarray:
 @pytest.mark.parametrize("kind", KINDS)
 @given(data=st.data())
 @settings(max_examples=2)
-def test_each_kind_of_operation_is_the_reference_s(kind: str, data: st.DataObject) -> None:
+def test_each_kind_of_operation_equals_the_reference(kind: str, data: st.DataObject) -> None:
     """Each kind of operation, with few others around it, computes the integers of the reference.
 
-    The compiler's sanitizers watch it, so that no overflow hides in a right result.
+    The compiler's sanitizers find overflows that a right result would hide.
     """
     core, tile_px = data.draw(cores((kind,), 2))
     assert_equal(core, tile_px, extremes((1, 3, tile_px, tile_px)), SANITIZED)
@@ -56,19 +56,19 @@ def test_each_kind_of_operation_is_the_reference_s(kind: str, data: st.DataObjec
 @needs_compiler
 @given(drawn=cores())
 @settings(max_examples=6)
-def test_any_network_is_the_reference_s(drawn: tuple[IntCore, int]) -> None:
-    """Kinds in any order compute the integers of the reference, though their maps share buffers."""
+def test_any_network_equals_the_reference(drawn: tuple[IntCore, int]) -> None:
+    """Operations in any order compute the integers of the reference, though maps share buffers."""
     core, tile_px = drawn
     assert_equal(core, tile_px, extremes((1, 3, tile_px, tile_px)), SANITIZED)
 
 
-def of_shipped(name: str) -> IntCore:
+def shipped_core(name: str) -> IntCore:
     """Return the core of a shipped network."""
     return read_core(load_onnx(shipped_pair(name)[1]))
 
 
 def planes_of(core: IntCore, tile_px: int) -> np.ndarray:
-    """The planes (2, P, H, W) of a tile: those of an image of noise, and the ends of int8."""
+    """Return planes (2, P, H, W) of a tile: those of an image of noise, and the ends of int8."""
     shape = (1, core.host_part.image_channels, tile_px, tile_px)
     image = np.random.default_rng(0).random(shape, dtype=np.float32)
     planes = core.host_part.encode(image)
@@ -76,29 +76,28 @@ def planes_of(core: IntCore, tile_px: int) -> np.ndarray:
 
 
 @needs_compiler
-def test_a_shipped_network_is_the_reference_s() -> None:
+def test_a_shipped_network_equals_the_reference() -> None:
     """A shipped network computes the integers of the reference on an image and on extremes."""
-    core = of_shipped("convbeers-xs")
+    core = shipped_core("convbeers-xs")
     assert_equal(core, 12, planes_of(core, 12), SANITIZED)
 
 
 @pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("name", shipped_names())
-def test_every_shipped_network_is_the_reference_s(name: str) -> None:
-    """Every shipped network does, in a small tile under sanitizers and in a larger one without."""
-    core = of_shipped(name)
+def test_every_shipped_network_equals_the_reference(name: str) -> None:
+    """Each is run on a small tile with sanitizers, and on a larger one without."""
+    core = shipped_core(name)
     assert_equal(core, 64, planes_of(core, 64), FAST)
     assert_equal(core, 16, planes_of(core, 16), SANITIZED)
 
 
 def test_the_file_states_what_it_is_and_no_name_ends_a_comment() -> None:
-    """Names of a network are no way to write code into the file, and its figures of memory are
-    right.
+    """Names in a network cannot inject code into the file, and its memory figures are right.
 
     The file includes one header of integers only, because a target may have no others.
     """
-    core = of_shipped("convbeers-xs")
+    core = shipped_core("convbeers-xs")
     first = replace(core.convolutions[0], name="*/ int x; /* ??/")
     text = c_program(replace(core, ops=(first, *core.ops[1:])), 32, "a.onnx */\n int y;")
     assert "int x" not in re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
@@ -114,9 +113,9 @@ def test_the_file_states_what_it_is_and_no_name_ends_a_comment() -> None:
 
 def test_sums_that_int32_does_not_hold_are_refused() -> None:
     """A layer whose sums exceed int32 is refused by name: signed overflow is undefined in C."""
-    core = of_shipped("convbeers-xs")
+    core = shipped_core("convbeers-xs")
     conv = core.convolutions[2]
-    # The largest weights and as many channels as make the sums 2^31.
+    # The largest weights, and enough channels for sums of 2^31.
     weight = np.full((1, 1 << 14, 3, 3), 127, np.int8)
     large = replace(conv, weight=weight, bias=conv.bias[:1])
     writer = LayerWriter(core, dict.fromkeys(core.frac_bits, (1, 8, 8)))
@@ -128,7 +127,7 @@ def test_tensors_that_are_needed_at_once_share_no_buffer() -> None:
     """No buffer is written while its tensor is still read, and few buffers suffice for all
     tensors.
     """
-    core = of_shipped("convbeers")
+    core = shipped_core("convbeers")
     size = {PLANES: 4, CORRECTION: 6} | {op.output: 16 for op in core.ops[:-1]}
     number, buffers = share_buffers(core, size)
     assert len(buffers) == 5
