@@ -1,4 +1,4 @@
-"""Random networks of everything that can be tiled, of small integers, whose sums are exact."""
+"""Random networks of operators that can be tiled, on small integers, whose sums are exact."""
 
 from fractions import Fraction
 from typing import Any
@@ -6,11 +6,11 @@ from typing import Any
 import onnx
 from hypothesis import strategies as st
 
-from tests.quant.tiling.small_networks import Row, real, taps, whole
+from tests.quant.tiling.small_networks import Row, float32_tensor, int64_tensor, taps
 
 
 class Builder(Row):
-    """A random network; every tensor has `at` pixels for one of the image."""
+    """A random network, whose last tensor has `at` pixels for each pixel of the image."""
 
     def __init__(self, draw: Any) -> None:
         super().__init__()
@@ -53,20 +53,21 @@ class Builder(Row):
         self.at /= 2
 
     def padded(self) -> None:
-        """By itself, then used up by a window; or moved, cut off on the one side that was not
-        padded.
+        """Append a pad, then a convolution that uses it up, or a slice that leaves a shifted map.
+
+        The slice cuts as much as was added, but from the opposite sides.
         """
         mode = self.draw(st.sampled_from(["constant", "edge", "reflect"]))
         before, behind = self.pads(2)[::2]
-        self.add("Pad", whole("pads", 0, 0, before, before, 0, 0, behind, behind), mode=mode)
+        self.add("Pad", int64_tensor("pads", 0, 0, before, before, 0, 0, behind, behind), mode=mode)
         if before == behind or self.draw(st.booleans()):
             self.convolve(3)
         else:
             self.add(
                 "Slice",
-                whole("from", behind, behind),
-                whole("to", *[-before or 1 << 62] * 2),
-                whole("axes", 2, 3),
+                int64_tensor("from", behind, behind),
+                int64_tensor("to", *[-before or 1 << 62] * 2),
+                int64_tensor("axes", 2, 3),
             )
 
     def transposed(self) -> None:
@@ -91,11 +92,17 @@ class Builder(Row):
     def resize(self) -> None:
         mode = self.draw(st.sampled_from(["nearest", "linear"]))
         where = self.draw(st.sampled_from(["asymmetric", "half_pixel", "pytorch_half_pixel"]))
-        self.add("Resize", "", real(1, 1, 2, 2), mode=mode, coordinate_transformation_mode=where)
+        self.add(
+            "Resize",
+            "",
+            float32_tensor(1, 1, 2, 2),
+            mode=mode,
+            coordinate_transformation_mode=where,
+        )
         self.at *= 2
 
     def join(self) -> None:
-        """Beside an earlier tensor of the same size, where there is one."""
+        """Concatenate an earlier tensor of the same size, if there is one."""
         if self.at in self.skips:
             name, channels = self.skips[self.at]
             self.add("Concat", name, axis=1)
@@ -103,15 +110,18 @@ class Builder(Row):
         self.skips[self.at] = self.tensor, self.channels
 
     def small(self) -> None:
-        """Back to small whole numbers: their sums are exact in any order, which a runtime chooses
-        by the size.
+        """Round and clip to small integers.
+
+        Their sums are exact in any order, and a runtime chooses the order by the size.
         """
-        self.add("Mul", real(0.125)).add("Floor").add("Clip", real(-255), real(255))
+        self.add("Mul", float32_tensor(0.125)).add("Floor").add(
+            "Clip", float32_tensor(-255), float32_tensor(255)
+        )
 
 
 @st.composite
 def networks(draw: Any) -> onnx.ModelProto:
-    """Small networks of everything that can be tiled, of whole numbers."""
+    """Draw a small network of operators that can be tiled, on integers."""
     builder = Builder(draw)
     parts = (
         Builder.conv,

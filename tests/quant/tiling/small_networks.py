@@ -1,6 +1,4 @@
-"""Small networks as users bring them: strides, pools, transposed convolutions, shuffles,
-enlargements, joins.
-"""
+"""Small networks with strides, pools, transposed convolutions, shuffles, resizes and concats."""
 
 import math
 from collections.abc import Mapping
@@ -44,19 +42,18 @@ def network(
     return model
 
 
-def whole(name: str, *values: int) -> onnx.TensorProto:
+def int64_tensor(name: str, *values: int) -> onnx.TensorProto:
     return numpy_helper.from_array(np.array(values, np.int64), name)
 
 
 def taps(name: str, *shape: int) -> onnx.TensorProto:
-    """Weights of small whole numbers, whose sums are exact in any order."""
-    # Sums of small integers are exact in float32, whatever order a runtime adds in.
+    """Return weights of small integers, whose sums are exact in float32 in any order."""
     values = np.random.default_rng(list(name.encode())).choice([-2, -1, 1, 2, 3], shape)
     return numpy_helper.from_array(values.astype(np.float32), name)
 
 
-def real(*values: float) -> onnx.TensorProto:
-    """Numbers, or one by itself."""
+def float32_tensor(*values: float) -> onnx.TensorProto:
+    """Return a float32 tensor of the values, or a scalar if there is one."""
     return numpy_helper.from_array(
         np.array(values if len(values) > 1 else values[0], np.float32), "real"
     )
@@ -72,9 +69,7 @@ def graph(
 
 
 class Row:
-    """A network written operator by operator, each of which reads what the last one made of the
-    image.
-    """
+    """A network that is written operator by operator; each one reads the result of the last."""
 
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
@@ -82,7 +77,7 @@ class Row:
         self.tensor = "image"
 
     def add(self, kind: str, *others: onnx.TensorProto | str, **attributes: Any) -> "Row":
-        """One more, and what it reads behind the last result: constants, and tensors by name."""
+        """Append an operator that reads the last result and `others`: constants or tensor names."""
         feeds = [self.tensor]
         name = f"t{len(self.nodes)}"
         for other in others:
@@ -104,7 +99,7 @@ SAME = "Conv<pads=[1,1,1,1]>"
 
 
 def float_unet() -> onnx.ModelProto:
-    """Convolution, pool, convolution, transposed convolution, beside the first, convolution."""
+    """Build a float U-Net of one level, which concatenates its first convolution as a skip."""
     nodes = f"""
         a = {SAME}(image, first)
         half = MaxPool<kernel_shape=[2,2], strides=[2,2]>(a)
@@ -118,12 +113,12 @@ def float_unet() -> onnx.ModelProto:
 
 
 CONV = "QLinearConv<pads=[1,1,1,1], strides=[{0},{0}]>({1}, unit, zero, {2}, fine, no, unit, zero)"
-"""An integer convolution of stride, tensor and weights."""
+"""An integer convolution; the placeholders are its stride, its tensor and its weights."""
 CORNER = 'coordinate_transformation_mode="asymmetric"'
 
 
 def int8_network(nodes: str, unit: float, **shapes: tuple[int, ...]) -> onnx.ModelProto:
-    """Return a network on integers, of which one represents `unit`."""
+    """Return a network on uint8 integers of the scale `unit`."""
     numbers: dict[str, ArrayLike] = {
         "unit": unit,
         "coarse": 16.0,
@@ -140,7 +135,7 @@ def int8_network(nodes: str, unit: float, **shapes: tuple[int, ...]) -> onnx.Mod
 
 
 def int8_unet() -> onnx.ModelProto:
-    """On integers, with the activations that an INT8 file may have, on a lattice of 4."""
+    """Build an INT8 U-Net with the activations that an INT8 file may have, aligned to 4 pixels."""
     unit = "unit, zero"
     nodes = f"""
         q = QuantizeLinear(image, coarse, zero)
@@ -162,7 +157,7 @@ def int8_unet() -> onnx.ModelProto:
 
 
 def espcn() -> onnx.ModelProto:
-    """Twice the size by a pixel shuffle."""
+    """Build a network that doubles the size by a pixel shuffle."""
     nodes = f"""
         a = Conv<pads=[2,2,2,2]>(image, in)
         b = Relu(a)
@@ -173,14 +168,14 @@ def espcn() -> onnx.ModelProto:
 
 
 def four_bands(bands_out: int = 4) -> onnx.ModelProto:
-    """Bands that are restored together, or made into others."""
+    """Build a network that restores four bands jointly, or computes other bands from them."""
     nodes = f"a = {SAME}(image, in) b = Relu(a) restored = {SAME}(b, out)"
     shapes = {"in": (8, 4, 3, 3), "out": (bands_out, 8, 3, 3)}
     return network(nodes, weights(**shapes), (4, bands_out))
 
 
 def ffdnet() -> onnx.ModelProto:
-    """Half the size inside, by a pixel unshuffle in front and a shuffle behind."""
+    """Build a network that works at half the size, between a pixel unshuffle and a shuffle."""
     nodes = f"""
         places = SpaceToDepth<blocksize=2>(image)
         a = {SAME}(places, in)
@@ -193,7 +188,7 @@ def ffdnet() -> onnx.ModelProto:
 
 
 def plain_int8_unet() -> onnx.ModelProto:
-    """On integers and operators of ONNX itself, on a lattice of 8."""
+    """Build an INT8 U-Net of ONNX's own operators, aligned to 8 pixels."""
     nodes = f"""
         q = QuantizeLinear(image, unit, zero)
         a_sum = {CONV.format(1, "q", "first")}
@@ -215,7 +210,7 @@ def plain_int8_unet() -> onnx.ModelProto:
 
 
 def half_resolution() -> onnx.ModelProto:
-    """A ConvBEERS of one block at scale 2, of weights that are large enough to show a seam."""
+    """Build a ConvBEERS of one block at scale 2, with weights large enough to show a seam."""
     network = ConvBEERS(Variant(blocks=1, features=8, scale=2))
     initialise(network, torch.Generator().manual_seed(0))
     with torch.no_grad():
@@ -226,7 +221,7 @@ def half_resolution() -> onnx.ModelProto:
 
 @cache
 def quantized_half_resolution() -> Quantized:
-    """The same in legal INT8, for the host and for the board."""
+    """Quantize `half_resolution` to legal INT8."""
     return quickly(
         half_resolution(),
         patches_of(list(np.random.default_rng(5).random((2, 1, 1, 48, 48), np.float32))),
@@ -234,12 +229,12 @@ def quantized_half_resolution() -> Quantized:
 
 
 def int8_half_resolution() -> onnx.ModelProto:
-    """The host's file of it."""
+    """Return the host's INT8 file of `half_resolution`."""
     return quantized_half_resolution().host
 
 
 def spans(size_px: int, kept_px: int, halo_px: int) -> list[tuple[int, int, int, int]]:
-    """Start and stop of each window and of what is kept of it, `kept_px` at a time."""
+    """Return start and stop of each window and of its kept part, in steps of `kept_px`."""
     marks = range(0, size_px, kept_px)
     return [
         (max(k - halo_px, 0), min(k + kept_px + halo_px, size_px), k, min(k + kept_px, size_px))
@@ -250,8 +245,10 @@ def spans(size_px: int, kept_px: int, halo_px: int) -> list[tuple[int, int, int,
 def check_tiles(
     model: onnx.ModelProto, image: np.ndarray, all_cells: tuple[int, ...], short_px: int = 0
 ) -> None:
-    """Tiles of so many lattice cells give the whole image (1, C, H, W) bit for bit; the halo may be
-    too short.
+    """Check that tiles give the result of the int64_tensor image (1, C, H, W), bit for bit.
+
+    Each number in `all_cells` is the side of a tile in steps of the alignment. The halo is shorter
+    by `short_px`.
     """
     tiling = tiling_of(model)
     session = open_session(any_size(model), 1)

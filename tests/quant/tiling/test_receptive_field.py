@@ -1,6 +1,4 @@
-"""How an image may be tiled: the whole image's result wherever it is allowed, one sentence
-elsewhere.
-"""
+"""Tests that tiles give the whole image's result, or that tiling is refused in a sentence."""
 
 from fractions import Fraction
 
@@ -112,12 +110,12 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("nodes", EXACT)
-def test_tiled_is_whole_and_no_smaller_halo_does(nodes: str) -> None:
+def test_tiles_give_the_whole_and_a_shorter_halo_does_not(nodes: str) -> None:
     check_halo(model_of(nodes), EXACT[nodes], (1, 3))
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_tiled_is_whole_of_larger_networks_and_shuffles(name: str) -> None:
+def test_tiles_of_larger_networks_and_shuffles_give_the_whole(name: str) -> None:
     check_halo(*OTHERS[name], (2, 5))
 
 
@@ -175,13 +173,12 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("sentence", REFUSED)
-def test_what_depends_on_the_place_or_the_whole_image_is_refused(sentence: str) -> None:
+def test_operators_that_read_positions_or_the_whole_image_are_refused(sentence: str) -> None:
     with pytest.raises(ModelError, match=sentence):
         tiling_of(model_of(REFUSED[sentence]))
 
 
-def test_constants_in_the_graph_are_followed() -> None:
-    """The weights are those of a node, not an initializer."""
+def test_weights_of_a_constant_node_are_read() -> None:
     weight = "w = Constant<value = float[1,1,3,1] {1, 1, 1}>()"
     assert tiling_of(model_of(f"{weight} restored = Conv<pads=[1,0,1,0]>(image, w)")).halo_px == 1
 
@@ -192,7 +189,7 @@ def check_any(
     cells: tuple[int, ...] = (1, 3),
     short_px: int = 0,
 ) -> None:
-    """Of digital numbers at random; the halo may be too short."""
+    """Check the tiles of an image of random digital numbers; the halo may be too short."""
     image = (
         np.random.default_rng(1)
         .integers(0, 4096, (1, tiling_of(model).channels_in, *size))
@@ -203,7 +200,7 @@ def check_any(
 
 @settings(max_examples=40)
 @given(networks(), st.integers(9, 40), st.integers(9, 40))
-def test_random_networks_are_tiled_as_a_whole(
+def test_tiles_of_random_networks_give_the_whole(
     model: onnx.ModelProto, height: int, width: int
 ) -> None:
     alignment_px = tiling_of(model).alignment_px

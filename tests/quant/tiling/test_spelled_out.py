@@ -1,6 +1,4 @@
-"""Pixel shuffles spelled out as torch does are seen as one operator; whatever else moves pixels is
-left as it is.
-"""
+"""Tests that torch's spelled-out pixel shuffles are read as one operator, and nothing else is."""
 
 import warnings
 from pathlib import Path
@@ -22,7 +20,7 @@ from tests.quant.tiling.small_networks import network
 
 
 def exported(module: nn.Module, any_size: bool, folder: Path, opset: int = 17) -> onnx.ModelProto:
-    """As torch's own exporter leaves it."""
+    """Export a module with torch's older exporter, which spells shuffles out."""
     path = folder / "network.onnx"
     axes = {2: "H", 3: "W"}
     with warnings.catch_warnings():
@@ -42,7 +40,7 @@ def exported(module: nn.Module, any_size: bool, folder: Path, opset: int = 17) -
 
 @pytest.mark.parametrize("any_size", [True, False])
 @pytest.mark.parametrize("size", [2, 5])
-def test_what_torch_makes_of_an_unshuffle_is_one(size: int, any_size: bool, tmp_path: Path) -> None:
+def test_a_spelled_out_unshuffle_is_read_as_one(size: int, any_size: bool, tmp_path: Path) -> None:
     count = size * size
     module = nn.Sequential(
         nn.PixelUnshuffle(size), nn.Conv2d(count, count, 3, padding=1), nn.PixelShuffle(size)
@@ -56,7 +54,7 @@ def test_what_torch_makes_of_an_unshuffle_is_one(size: int, any_size: bool, tmp_
     ]
 
 
-def test_a_shuffle_of_an_old_opset_is_one(tmp_path: Path) -> None:
+def test_a_shuffle_of_an_old_opset_is_read_as_one(tmp_path: Path) -> None:
     model = exported(
         nn.Sequential(nn.Conv2d(1, 4, 1), nn.PixelShuffle(2)), False, tmp_path, opset=9
     )
@@ -83,19 +81,19 @@ OTHER_MOVES = [
 
 
 @pytest.mark.parametrize("nodes", OTHER_MOVES)
-def test_whatever_else_moves_pixels_is_not_changed(nodes: str) -> None:
+def test_other_operators_that_move_pixels_are_not_changed(nodes: str) -> None:
     model = network(nodes, NUMBERS)
     assert [node.proto for node in with_shuffles(model).nodes] == list(model.graph.node)
     with pytest.raises(ModelError, match=" moves pixels"):
         tiling_of(model)
 
 
-def test_moves_that_lead_back_are_a_shuffle_of_one() -> None:
+def test_operators_that_cancel_are_a_shuffle_of_block_one() -> None:
     model = network("more = Unsqueeze(image, at) restored = Squeeze(more, at)", NUMBERS)
     assert tiling_of(model) == Tiling(0)
 
 
-def test_moves_between_integers_are_of_integers() -> None:
+def test_operators_that_move_integers_are_integer_operators() -> None:
     nodes = """
         int8 = QuantizeLinear(image, unit, zero)
         seen = DequantizeLinear(int8, unit, zero)
