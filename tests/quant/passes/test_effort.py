@@ -1,4 +1,4 @@
-"""The bound of the search: counted before it begins, kept by it, and the same every time."""
+"""Tests that the search announces a bound on its work and keeps it."""
 
 import logging
 import re
@@ -77,7 +77,7 @@ def test_work_counts_multiply_accumulates(graph: Graph) -> None:
 def counted(
     model: onnx.ModelProto, level: Effort, monkeypatch: pytest.MonkeyPatch
 ) -> tuple[Quantized, int]:
-    """The quantised network, and how many candidates were measured."""
+    """Return the quantised network and the number of candidates that were measured."""
     measured: list[int] = []
     costs = CropTrials._costs
 
@@ -108,10 +108,10 @@ def test_no_more_is_tried_than_is_announced_and_more_effort_tries_more(
     assert counts == sorted(counts)
 
 
-def test_running_only_what_changes_costs_the_same_as_running_all(
+def test_running_only_changed_layers_gives_the_cost_of_running_all(
     float_onnx: onnx.ModelProto, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen: list[tuple[np.ndarray, np.ndarray]] = []
+    costs_of_both: list[tuple[np.ndarray, np.ndarray]] = []
     costs = CropTrials._costs
 
     def both(self: CropTrials, parts: list, values: list, core: IntCore):  # type: ignore[no-untyped-def,type-arg]
@@ -122,11 +122,11 @@ def test_running_only_what_changes_costs_the_same_as_running_all(
             difference = whole.run(None, {"image": target.image})[0] - target.result
             error = np.linalg.norm(difference) / np.sqrt(difference.size) / change
             errors.append(target.weight * error)
-        seen.append((cost(None), np.array(errors)))
+        costs_of_both.append((cost(None), np.array(errors)))
         return cost
 
     monkeypatch.setattr(CropTrials, "_costs", both)
     quantize_model(float_onnx, patches_of(waves(2)), {}, effort=Effort.fast)
-    assert len(seen) > 12
-    for partial, whole in seen:
+    assert len(costs_of_both) > 12
+    for partial, whole in costs_of_both:
         np.testing.assert_allclose(partial, whole, rtol=1e-6)

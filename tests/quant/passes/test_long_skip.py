@@ -1,6 +1,4 @@
-"""Taking the image out of a long skip connection leaves the float network as it was, and makes its
-sums small.
-"""
+"""Tests that a split long skip keeps the float network and makes its sums small."""
 
 from dataclasses import replace
 
@@ -43,7 +41,7 @@ def conv(generator: np.random.Generator, source: str, output: str, shape: tuple[
 
 
 def skipping(seed: int, channels: int = 1, head: int = 3, tail: int = 3) -> Graph:
-    """A body whose features are added to those of the head, which it reads too."""
+    """Build a network whose body reads the features of the head and is added to them."""
     generator = np.random.default_rng(seed)
     first = conv(generator, IMAGE, "head", (FEATURES, channels, head, head))
     inner = conv(generator, "head", "inner", (FEATURES, FEATURES, 3, 3))
@@ -65,7 +63,7 @@ def run(graph: Graph, names: list[str], channels: int = 1) -> list[np.ndarray]:
     head=st.sampled_from([1, 3, 5]),
     tail=st.sampled_from([1, 3]),
 )
-def test_the_float_network_stays_also_at_the_border(
+def test_the_float_network_is_unchanged_even_at_the_border(
     seed: int, channels: int, head: int, tail: int
 ) -> None:
     graph = skipping(seed, channels, head, tail)
@@ -96,7 +94,7 @@ def test_a_head_that_nothing_else_reads_is_replaced() -> None:
     np.testing.assert_allclose(after, before, atol=2e-4)
 
 
-def spoilt() -> dict[str, Graph]:
+def graphs_without_long_skip() -> dict[str, Graph]:
     first, body, add, last = skipping(0)
     assert isinstance(add, Add)
     assert isinstance(first, Conv)
@@ -112,14 +110,14 @@ def spoilt() -> dict[str, Graph]:
     }
 
 
-@pytest.mark.parametrize("name", spoilt())
+@pytest.mark.parametrize("name", graphs_without_long_skip())
 def test_other_sums_are_left_alone(name: str) -> None:
-    graph = spoilt()[name]
+    graph = graphs_without_long_skip()[name]
     assert split_long_skip(graph) is graph
 
 
 class Bright(nn.Module):
-    """A network whose head carries the image far above the details that its result consists of."""
+    """A network whose features contain the image, which is far larger than the restored details."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -159,7 +157,7 @@ def test_int8_errs_less(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def assert_pixel_is_exact(int8: Quantized) -> None:
-    """The pixel's channels hold all 12 bits, and full scale does not count as clipped."""
+    """Check that the pixel's channels hold all 12 bits, and that full scale is not reported."""
     every_dn = np.arange(4096, dtype=np.float32).reshape(1, 1, 64, 64) / 4095
     planes = int8.core.host_part.encode(every_dn)
     tensors, _ = run_core(int8.core, planes)

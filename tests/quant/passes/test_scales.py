@@ -1,4 +1,4 @@
-"""Scales moved between rounds of training: better, as legal, and tied to each other as before."""
+"""Tests that scales moved between rounds of training are better, legal, and still tied."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ PLANES_OF_NOISE = np.random.default_rng(0).integers(-128, 128, (1, 3, 12, 10)).a
 
 
 def distance(core: IntCore, target: torch.Tensor) -> float:
-    """Mean squared difference of a core's correction of noise from a target."""
+    """Return the mean squared difference between a core's correction of noise and a target."""
     return float((correction_of(core) - target).square().mean())
 
 
@@ -32,7 +32,7 @@ def correction_of(core: IntCore) -> torch.Tensor:
 
 
 def chain(seed: int) -> tuple[Graph, IntCore]:
-    """Two convolutions in float and in integers."""
+    """Return two convolutions in float and in integers."""
     generator = np.random.default_rng(seed)
 
     def conv(name: str, source: str, shape: tuple[int, ...]) -> Conv:
@@ -72,7 +72,7 @@ def test_coarse_weights_become_finer() -> None:
 
 
 def tried(core: IntCore, graph: Graph, shifts: Shifts = SHIFTS) -> list[IntCore]:
-    """Every core that is tried: none is worse than the one before, so each move is kept."""
+    """Return every core that is tried, with a falling loss, so that each move is kept."""
     cores = list[IntCore]()
 
     def loss_of(candidate: IntCore) -> float:
@@ -85,7 +85,7 @@ def tried(core: IntCore, graph: Graph, shifts: Shifts = SHIFTS) -> list[IntCore]
 
 
 def exact_adds(core: IntCore) -> set[str]:
-    """The names of the adds that have one scale."""
+    """Return the names of the adds that have one scale."""
     names = set[str]()
     for op in core.ops:
         scales = {core.frac_bits[name] for name in (*op.inputs, op.output)}
@@ -112,14 +112,14 @@ def test_every_core_tried_is_legal_and_trained_as_the_reference_runs_it(
     assert moved(core, cores[-1]) > 0
     for each in cores:
         assert shift_faults(each) == []
-        # Ties are held by `shift_faults`, and adds that were exact by moving together.
+        # `shift_faults` checks ties. Exact adds stay exact because their tensors move jointly.
         assert exact_adds(each) >= exact_adds(core)
         assert each.frac_bits[PLANES] == 7
         assert each.frac_bits["b"] == core.frac_bits["b"]
     hold_to_reference(TrainableCore(cores[-1]), PLANES_OF_NOISE)
 
 
-def test_what_shares_a_scale_moves_together() -> None:
+def test_tensors_that_share_a_scale_move_jointly() -> None:
     """Tensors that must share a scale share it in every core, however many moves were kept."""
     graph = odd_operations(np.random.default_rng(3))
     core = build_core(graph, {op.output: 5 for op in graph} | {PLANES: 7})
@@ -131,7 +131,7 @@ def test_what_shares_a_scale_moves_together() -> None:
 
 
 def test_finer_weights_stand_for_the_same_values() -> None:
-    """Made coarser and finer again, weights have the coarser values on the finer scale."""
+    """Weights that become coarser and finer again keep the coarser values, on the finer scale."""
     _, core = chain(2)
     coarse = TrainableCore(core).with_finer_numbers("weight", 0, by=-2)
     fine = coarse.with_finer_numbers("weight", 0, by=2)
@@ -145,9 +145,7 @@ def test_finer_weights_stand_for_the_same_values() -> None:
 
 
 def test_where_relu6_clips_the_end_of_int8_stays() -> None:
-    """Only the result may move if all else is written by a ReLU6: the end of int8 may stand for
-    its 6.
-    """
+    """Only the result's scale may move: ReLU6 writes the others, and its 6 may be int8's end."""
     graph = with_relu6(1.0)
     core = build_core(graph, {PLANES: 7, "a": 4, "b": 4, "c": 5, CORRECTION: 5})
     for each in tried(core, graph):

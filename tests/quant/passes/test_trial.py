@@ -1,6 +1,4 @@
-"""The crops of a search contain what int8 clips: strong edges, and ground as bright as the sensor
-reads.
-"""
+"""Tests that the crops of a search contain what int8 clips: edges and the brightest ground."""
 
 import numpy as np
 import pytest
@@ -24,7 +22,7 @@ def test_bright_ground_has_the_details_of_its_crop(
     np.testing.assert_allclose(bright[:, :2].max((0, 2, 3)), ends[:2, 0, 0], rtol=1e-5)
     lift = bright - crop
     np.testing.assert_allclose(lift, np.broadcast_to(lift[..., :1, :1], lift.shape), atol=1e-4)
-    # A map of a noise level is not the ground's brightness.
+    # A map of a noise level does not depend on the ground's brightness.
     np.testing.assert_array_equal(bright[:, 2], crop[:, 2].astype(np.float32))
 
 
