@@ -41,7 +41,7 @@ def patches() -> Patches:
 
 @pytest.fixture(scope="session")
 def unseen() -> Patches:
-    """Of another scene than calibration's."""
+    """Return patches of another scene than that of calibration."""
     return drawn(6, seed=78, scene=77, patch_px=80)
 
 

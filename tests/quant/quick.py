@@ -1,6 +1,4 @@
-"""What tests of quantising begin with: an image, patches of images, a copy to be spoilt, a search
-in a moment.
-"""
+"""Helpers of the quantiser's tests: images, patches, changed copies, and a fast search."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -34,20 +32,20 @@ from beers_deploy.quant.session import open_session, planes_of
 
 
 def image(height: int = 37, width: int = 53, seed: int = 0) -> np.ndarray:
-    """Noise of digital numbers of 12 bits, (1, 1, height, width) float32 in [0, 1]."""
+    """Return noise of digital numbers of 12 bits, (1, 1, height, width) float32 in [0, 1]."""
     dn = np.random.default_rng(seed).integers(0, 4096, (1, 1, height, width))
     return dn.astype(np.float32) / np.float32(4095)
 
 
 def waves(count: int = 3) -> list[np.ndarray]:
-    """Smooth images (1, 1, 40, 40)."""
+    """Return smooth images (1, 1, 40, 40)."""
     rows, columns = np.mgrid[:40, :40] / 40
     images = [0.4 + 0.3 * np.sin(9 * rows + k) * np.cos(7 * columns) for k in range(count)]
     return [each.astype(np.float32)[None, None] for each in images]
 
 
 def patches_of(images: list[np.ndarray]) -> Patches:
-    """These images, each its own reference."""
+    """Return patches of these images, each its own reference."""
     return Patches([(image, image) for image in images], images)
 
 
@@ -57,16 +55,14 @@ def without_references(patches: Patches) -> Patches:
 
 
 def drawn(count: int, seed: int, scene: int = 1, patch_px: int = 128) -> Patches:
-    """Of one drawn scene, through the usual sensors."""
+    """Return patches of one procedural scene, through the usual sensors."""
     ground = procedural_scene(900, 960, np.random.default_rng(scene))
     sensors = Sensor.load("pleiades-degraded"), Sensor.load("pleiades-reference")
     return draw_patches([ground], *sensors, count, seed, patch_px=patch_px)
 
 
 def with_relu6(size: float) -> Graph:
-    """A depthwise convolution between others, behind each a ReLU6; the larger `size`, the more is
-    clipped.
-    """
+    """Build convolutions with ReLU6, one of them depthwise; a larger `size` clips more."""
     generator = np.random.default_rng(0)
     shapes = {"a": (5, 3, 3, 3), "b": (5, 1, 3, 3), "c": (4, 5, 1, 1), CORRECTION: (1, 4, 3, 3)}
     graph = list[Op]()
@@ -84,13 +80,13 @@ def with_relu6(size: float) -> Graph:
 def in_float(
     graph: Graph, image: np.ndarray, host_part: HostPart = ONE_CHANNEL, name: str = CORRECTION
 ) -> np.ndarray:
-    """What a plane-reading float graph makes of an image, or another of its tensors."""
+    """Run a float graph that reads planes, and return its correction or another tensor."""
     session = open_session(graph_to_onnx(graph, [name], host_part.planes))
     return np.asarray(session.run(None, {PLANES: planes_of(image, host_part)})[0])
 
 
 def behind_conv(write: Callable[[GraphWriter], object]) -> onnx.ModelProto:
-    """A convolution of one pixel, and behind it what `write` writes from `x` to `restored`."""
+    """Build a 1 x 1 convolution, followed by what `write` writes from `x` to `restored`."""
     writer = GraphWriter()
     writer.node(
         "Conv", "x", ["image", writer.constant("w", np.ones((2, 1, 1, 1), np.float32))], "first"
@@ -116,7 +112,7 @@ def change(model: onnx.ModelProto, name: str, by: Callable[[np.ndarray], np.ndar
 def changed(
     model: onnx.ModelProto, name: str, by: Callable[[np.ndarray], np.ndarray]
 ) -> onnx.ModelProto:
-    """A copy with one weight or bias changed."""
+    """Return a copy with one weight or bias changed."""
     copy = copied(model)
     change(copy, name, by)
     return copy
@@ -124,7 +120,7 @@ def changed(
 
 @contextmanager
 def one_guess() -> Iterator[None]:
-    """One guess in the place of the search that equalises channels."""
+    """Replace the search that equalises channels by one guess."""
     guess: dict[str, Any] = {"GAMMAS": (0.5,), "HEADROOM": (1.0,)}
     with (
         patch.multiple("beers_deploy.quant.passes.equalize", STEPS=(), **guess),
@@ -139,7 +135,7 @@ def quickly(model: onnx.ModelProto, patches: Patches, **more: Any) -> Quantized:
 
 
 class Calibration(CalibrationDataReader):  # type: ignore[misc]  # onnxruntime has no types
-    """Images for somebody else's quantiser."""
+    """A reader of images for onnxruntime's quantiser."""
 
     def __init__(self, images: list[np.ndarray]) -> None:
         self._images = iter(images)

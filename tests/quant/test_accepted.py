@@ -1,6 +1,4 @@
-"""Networks that cannot be quantised are refused in a sentence; odd ones that can be lose no more
-than others.
-"""
+"""Tests that invalid graphs are refused, and that odd ones lose no more than others."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -34,7 +32,7 @@ def graph(float_onnx: onnx.ModelProto) -> Graph:
 
 
 def with_conv(graph: Graph, name: str, **changes: Callable[[Any], Any]) -> Graph:
-    """The graph in which one convolution has other arrays, or another input."""
+    """Return the graph with other arrays, or another input, of one convolution."""
     operator = next(op for op in graph if op.name == name)
     assert isinstance(operator, Conv)
     other = replace(
@@ -48,7 +46,7 @@ def twice(values: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("corrupt", "message"),
     [
         (lambda _: (), "does not exist"),
         (
@@ -67,18 +65,18 @@ def twice(values: np.ndarray) -> np.ndarray:
         ),
     ],
 )
-def test_what_cannot_be_quantized_is_refused(
-    spoil: Callable[[Graph], Graph], message: str, graph: Graph
+def test_graphs_that_cannot_be_quantized_are_refused(
+    corrupt: Callable[[Graph], Graph], message: str, graph: Graph
 ) -> None:
     check_network(SplitNetwork(graph))
     with pytest.raises(ModelError, match=message):
-        check_network(SplitNetwork(spoil(graph)))
+        check_network(SplitNetwork(corrupt(graph)))
 
 
 def test_a_layer_that_never_fires_costs_nothing(
     float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
 ) -> None:
-    """Weights that meet only zeros cannot be fitted to them; the bias behind them still counts."""
+    """Weights that read only zeros cannot be fitted. The bias behind them still counts."""
     dead = changed(float_onnx, "body.0.first.bias", lambda bias: bias - 50)
     dead = changed(dead, "body.0.second.bias", lambda bias: bias + 0.05)
 
@@ -94,9 +92,7 @@ def test_a_layer_that_never_fires_costs_nothing(
 def test_a_branch_of_tiny_values_stays_legal(
     share: float, float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
-    """An add moves the branch to the stream's scale long after its weights were given one of their
-    own.
-    """
+    """The add moves the branch to the stream's scale, after its weights got their own."""
     tiny = changed(float_onnx, "body.0.second.weight", lambda weight: weight * share)
     tiny = changed(tiny, "body.0.second.bias", lambda bias: bias * share)
     assert shift_faults(quickly(tiny, patches).core) == []

@@ -1,4 +1,4 @@
-"""Activations that a DPU lacks: replaced exactly or by others, compensated, measured, quantised."""
+"""Tests that activations which a DPU lacks are replaced, compensated, measured and quantised."""
 
 import dataclasses
 from collections.abc import Callable
@@ -37,17 +37,17 @@ DPU_SLOPE = 26 / 256
 """The one slope of a LeakyReLU that a DPU computes."""
 TO_ORIGINAL = "PSNR to the original, compensated"
 Act = Callable[[GraphWriter, str, str], str]
-"""Writes an activation: of a tensor, under a name."""
+"""A function that writes an activation of a tensor under a name."""
 
 
 def silu(w: GraphWriter, x: str, name: str) -> str:
-    """x * Sigmoid(x), as exporters write it."""
+    """Write x * Sigmoid(x) as exporters do."""
     gate = w.node("Sigmoid", f"{name}.gate", [x])
     return w.node("Mul", name, [x, gate])
 
 
 def quick_gelu(w: GraphWriter, x: str, name: str) -> str:
-    """x * Sigmoid(1.702 x), as exporters write it."""
+    """Write x * Sigmoid(1.702 x) as exporters do."""
     factor = w.constant("1.702", np.array(1.702, np.float32))
     scaled = w.node("Mul", f"{name}.c", [x, factor])
     gate = w.node("Sigmoid", f"{name}.s", [scaled])
@@ -73,7 +73,7 @@ def gelu(divides: bool) -> Act:
 
 
 def gated(w: GraphWriter, x: str, name: str) -> str:
-    """A Sigmoid that multiplies another tensor."""
+    """Write a Sigmoid that multiplies another tensor."""
     other = conv(w, x, f"{name}.other")
     gate = w.node("Sigmoid", f"{name}.s", [x])
     return w.node("Mul", name, [other, gate])
@@ -109,7 +109,7 @@ def hard_sigmoid(slope: float, offset: float) -> Act:
 
 
 def conv(w: GraphWriter, source: str, name: str, shape: tuple[int, ...] = ()) -> str:
-    """A convolution with drawn weights and pads that keep the size."""
+    """Write a convolution with random weights and pads that keep the size."""
     shape = shape or (FEATURES, FEATURES, 3, 3)
     generator = np.random.default_rng(sum(map(ord, name)))
     bound = np.prod(shape[1:]) ** -0.5
@@ -133,7 +133,7 @@ def finished(w: GraphWriter, px: int | None = None) -> onnx.ModelProto:
 
 
 def network(act: Act) -> onnx.ModelProto:
-    """Three convolutions with an activation behind the first two, and one behind a sum."""
+    """Build three convolutions, with activations behind the first two and behind a sum."""
     w = GraphWriter()
     a = conv(w, "image", "a", IMAGE_WEIGHTS)
     first = act(w, a, "first")
@@ -152,7 +152,7 @@ def one_image(pixels: np.ndarray) -> np.ndarray:
 
 
 def patches(count: int, seed: int, px: int = 48) -> Patches:
-    """Smooth images with noise, and the same without it."""
+    """Return smooth images with noise, and the same without it as references."""
     generator = np.random.default_rng(seed)
     rows, columns = np.mgrid[:px, :px] / px
     pairs = []
@@ -165,7 +165,7 @@ def patches(count: int, seed: int, px: int = 48) -> Patches:
 
 
 def attention_network(free: bool) -> onnx.ModelProto:
-    """RLFN's attention behind a convolution, for images of 48 pixels or of any size."""
+    """Build RLFN's attention behind a convolution, for images of 48 pixels or of any size."""
     w = GraphWriter()
     source = conv(w, "image", "a", IMAGE_WEIGHTS)
     values = np.random.default_rng(3).normal(0, 0.3, (FEATURES, FEATURES, 3, 3))
@@ -235,7 +235,9 @@ def test_leaky_relu_and_prelu_are_two_branches_and_an_add_exactly(act: Act) -> N
 
 @settings(max_examples=10, deadline=None)
 @given(st.floats(0.05, 2), st.floats(-1, 1))
-def test_hard_sigmoid_of_any_slope_is_that_of_a_sixth_exactly(slope: float, offset: float) -> None:
+def test_hard_sigmoid_of_any_slope_becomes_one_of_a_sixth_exactly(
+    slope: float, offset: float
+) -> None:
     """A HardSigmoid of any slope and offset becomes one of a slope of a sixth without a loss.
 
     The slope of a sixth is the one that a DPU computes.
@@ -329,7 +331,7 @@ def test_least_squares_find_the_weights_of_any_convolution(
     for pixels in HELD_OUT.degraded:
         expected = result_of(open_session(model), pixels)
         actual = result_of(open_session(fitted), pixels)
-        # The penalty holds back directions that the samples hardly have.
+        # The penalty shrinks directions that hardly occur in the samples.
         assert np.square(actual - expected).mean() < 1e-4 * expected.var()
 
 
@@ -362,7 +364,7 @@ def silu_but_tanh_third(w: GraphWriter, x: str, name: str) -> str:
     return act(w, x, name)
 
 
-def test_what_a_dpu_has_and_what_nothing_replaces_stays() -> None:
+def test_activations_that_are_supported_or_irreplaceable_stay() -> None:
     """A network without anything to replace is returned as it is.
 
     An operator without a replacement is refused by its name before time is spent on a fit.
@@ -372,7 +374,7 @@ def test_what_a_dpu_has_and_what_nothing_replaces_stays() -> None:
         assert adapt(model, SAMPLES, HELD_OUT).model is model
     with pytest.raises(ModelError, match="Tanh first"):
         read_network(network(tanh))
-    # Refused before anything is fitted, next to what is replaced as well.
+    # The refusal comes before any fit, even if other activations can be replaced.
     with pytest.raises(ModelError, match="Tanh third"):
         adapt(network(silu_but_tanh_third), BARE, BARE)
 
@@ -441,7 +443,7 @@ def test_the_gate_counts_the_relus_of_an_adapted_network(
     This holds even where HardSwish is computed by the table of a ReLU.
     """
     model = network(act)
-    # On scales of some hundreds all of HardSwish and HardSigmoid that bends is one unit.
+    # With scales of some hundreds, the curved part of HardSwish and HardSigmoid is one unit.
     change(model, "a.w", lambda weight: 1e4 * weight)
     int8 = quickly(replaced(model, approximated, exact), BARE)
 
@@ -484,7 +486,7 @@ def test_spatial_attention_is_aligned_and_compensated(free: bool) -> None:
 def test_finetuning_learns_from_the_original() -> None:
     """Fine-tuning that is given the original ends nearer to it than without.
 
-    What a replacement lost is so won back by the training that users ask for anyway.
+    The training that users ask for anyway then recovers the loss of a replacement.
     """
     model = network(silu)
     near = replaced(model, {Kind.silu}, ())

@@ -1,6 +1,4 @@
-"""Layer by layer the integer reference and onnxruntime say the same, and what the DPU's rule
-changes is counted.
-"""
+"""Tests of the layer-by-layer comparison of the integer reference with onnxruntime."""
 
 from pathlib import Path
 
@@ -44,7 +42,7 @@ def test_a_layer_that_computes_something_else_is_found(quantized: Quantized) -> 
     assert unequal["tail"]
 
 
-def test_what_the_rule_moves_is_counted(quantized: Quantized) -> None:
+def test_changes_by_the_rounding_rule_are_counted(quantized: Quantized) -> None:
     layers = agreement(quantized.core, quantized.host, IMAGE)
     up, even = (
         run_core(quantized.core, IMAGE_SLICES.encode(IMAGE), half_even=rule)[0]

@@ -1,6 +1,4 @@
-"""Networks of users: quantised, held to the integer reference bit for bit, bounded, read back, and
-tiled.
-"""
+"""Tests that users' networks are quantised, equal the reference, keep bounds and can be tiled."""
 
 import json
 from collections.abc import Callable
@@ -34,15 +32,13 @@ from beers_deploy.quant.tiling.receptive_field import tiling_of
 from examples.networks import NETWORKS, build, to_onnx
 from tests.quant.quick import copied, patches_of, quickly
 from tests.quant.tiling.small_networks import check_tiles
-from tests.quant.trained import hold_to_reference, moved
+from tests.quant.trained import assert_equals_reference, moved
 
 SIDE_PX = 48
 
 
 def images(name: str, count: int = 3, side_px: int = SIDE_PX) -> list[np.ndarray]:
-    """Smooth patches with an edge, of the network's channels and size: (1, C, h, w) float32 in [0,
-    1].
-    """
+    """Return smooth patches with an edge, (1, C, h, w) float32 in [0, 1], for a network."""
     side = side_px
     generator = np.random.default_rng(7)
     rows, columns = np.mgrid[:side, :side] / side
@@ -79,7 +75,7 @@ def test_int8_stays_near_float(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_the_integer_reference_is_the_runtime_bit_for_bit(name: str) -> None:
+def test_the_integer_reference_equals_the_runtime_bit_for_bit(name: str) -> None:
     int8 = quantized(name)
     image = images(name)[2]
     layers = agreement(int8.core, int8.host, image)
@@ -89,9 +85,9 @@ def test_the_integer_reference_is_the_runtime_bit_for_bit(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_what_is_trained_computes_the_reference_s_whole_numbers(name: str) -> None:
+def test_training_computes_the_integers_of_the_reference(name: str) -> None:
     int8 = quantized(name)
-    hold_to_reference(moved(int8.core), int8.core.host_part.encode(images(name, 4)[3]))
+    assert_equals_reference(moved(int8.core), int8.core.host_part.encode(images(name, 4)[3]))
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -122,7 +118,7 @@ def test_a_file_is_read_back_as_the_core_it_was_written_from(name: str) -> None:
     )
 
 
-def test_a_weight_that_is_not_what_the_file_says_is_a_fault() -> None:
+def test_a_node_that_differs_from_the_description_is_a_fault() -> None:
     corrupted = copied(quantized("unet").host)
     node = next(
         candidate for candidate in corrupted.graph.node if candidate.op_type == "ConvInteger"
@@ -143,7 +139,7 @@ def test_a_weight_that_is_not_what_the_file_says_is_a_fault() -> None:
         lambda description: description["ops"].clear(),
     ],
 )
-def test_a_description_of_something_else_is_one_sentence(
+def test_an_invalid_description_raises_no_other_error(
     change: Callable[[dict[str, Any]], object],
 ) -> None:
     corrupted = copied(quantized("unet").host)
@@ -166,14 +162,14 @@ def test_the_core_is_legal_on_the_dpu(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_tiles_of_int8_are_the_whole(name: str) -> None:
+def test_tiles_of_int8_give_the_whole(name: str) -> None:
     model = quantized(name).host
     alignment_px = tiling_of(model).alignment_px
     check_tiles(model, images(name, 1, 64)[0], (16 // alignment_px, 24 // alignment_px))
 
 
 def one_convolution(weight: float, bias: float) -> onnx.ModelProto:
-    """image * weight + bias, without a global add."""
+    """Build image * weight + bias, without a global add."""
     writer = GraphWriter()
     weights = writer.constant("w", np.full((1, 1, 1, 1), weight, np.float32))
     writer.node(

@@ -1,6 +1,4 @@
-"""Calibration patches: spread over light, blur and noise; made anew each time; statistics the same
-in pieces.
-"""
+"""Tests that calibration patches cover the ranges, repeat, and can be processed in pieces."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -45,7 +43,7 @@ def drawn(scenes: list[Scene]) -> Patches:
     return draw_patches(scenes, VARIABLE, REFERENCE, count=12, seed=3, patch_px=40)
 
 
-def test_patches_are_the_same_however_they_are_asked_for(drawn: Patches) -> None:
+def test_patches_are_the_same_at_each_access(drawn: Patches) -> None:
     passes = [list(drawn.pairs), list(drawn.pairs)]
     for number, (once, second) in enumerate(zip(*passes, strict=True)):
         alone = drawn.degraded[number]
@@ -59,7 +57,7 @@ def test_patches_are_the_same_however_they_are_asked_for(drawn: Patches) -> None
         drawn.pairs[12]
 
 
-def test_the_digest_names_the_bytes(scenes: list[Scene], drawn: Patches) -> None:
+def test_the_digest_identifies_the_bytes(scenes: list[Scene], drawn: Patches) -> None:
     def digest(seed: int, count: int = 12) -> str:
         return draw_patches(scenes, VARIABLE, REFERENCE, count, seed, patch_px=40).digest
 
@@ -68,9 +66,7 @@ def test_the_digest_names_the_bytes(scenes: list[Scene], drawn: Patches) -> None
 
 
 def test_the_ranges_are_covered_without_gaps(scenes: list[Scene]) -> None:
-    """With 40 strata, each 1/40 of the candidates: no gap in the MTF exceeds a few strata, and both
-    ends are seen.
-    """
+    """With 40 strata, no gap in the MTF exceeds a few of them, and both ends are covered."""
     views = draw_patches(scenes, VARIABLE, REFERENCE, count=40, seed=0, patch_px=40).views
     low = VARIABLE.mtf_nyquist.low
     high = VARIABLE.mtf_nyquist.high
@@ -91,14 +87,14 @@ def test_a_whole_response_stays_with_every_view(scenes: list[Scene]) -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(count=st.integers(1, 30), size=st.integers(1, 9), seed=st.integers(0, 2**31))
-def test_each_group_gives_one(count: int, size: int, seed: int) -> None:
+def test_each_stratum_gives_one_pick(count: int, size: int, seed: int) -> None:
     generator = np.random.default_rng(seed)
     candidates = [float(k) for k in generator.permutation(count * size)]
     picks = stratified(candidates, lambda value: value, count, generator)
     assert sorted(int(value) // size for value in picks) == list(range(count))
 
 
-def test_light_blur_and_noise_are_matched_at_random(scenes: list[Scene]) -> None:
+def test_light_blur_and_noise_are_uncorrelated(scenes: list[Scene]) -> None:
     views = draw_patches(scenes, VARIABLE, REFERENCE, count=200, seed=1, patch_px=40).views
     keys: list[Callable[[int], float]] = [
         lambda k: views[k].ground.brightness,
@@ -117,8 +113,8 @@ def test_scenes_too_small_for_a_patch_are_refused(scenes: list[Scene]) -> None:
 @pytest.mark.parametrize(
     "shape", [(TILE_PX, 31), (TILE_PX + 1, 37), (2 * TILE_PX + 3, TILE_PX + 70)]
 )
-def test_pieces_hold_what_the_whole_image_gives(graph: Graph, shape: tuple[int, int]) -> None:
-    """And no run returns more than a piece with its halo, which bounds memory."""
+def test_pieces_contain_the_values_of_the_whole_image(graph: Graph, shape: tuple[int, int]) -> None:
+    """No run returns more than a piece with its halo, which bounds memory."""
     names = tensors(graph)
     full_image = image(*shape)
     halo_px = halo_of(graph)
@@ -145,10 +141,10 @@ def test_crops_tile_the_image() -> None:
     np.testing.assert_array_equal(np.concatenate(pieces, axis=2), full_image)
 
 
-def test_positions_of_a_large_image_are_those_of_its_whole(
+def test_scales_of_a_large_image_are_those_of_whole_tensors(
     graph: Graph,
 ) -> None:
-    """In pieces or at once: found here by hand from whole tensors."""
+    """The image is calibrated in pieces. The expected scales follow from whole tensors."""
     full_image = image(TILE_PX + 21, 50)
     frac_bits = choose_frac_bits(graph, [full_image], least_squares=False)
     names = tensors(graph)

@@ -1,4 +1,4 @@
-"""The checksum of an INT8 file: every change of its integers after it was written is found."""
+"""Tests that the checksum of an INT8 file finds every later change of its integers."""
 
 from copy import deepcopy
 from pathlib import Path
@@ -42,7 +42,7 @@ def flipped(model: onnx.ModelProto, number: int, bit: int) -> onnx.ModelProto:
 
 @given(st.integers(0, 200), st.integers(0, 1 << 20))
 def test_every_flip_of_a_constant_is_found(number: int, bit: int) -> None:
-    """Of weights, biases and scales, in the highest bit as in the lowest."""
+    """It covers weights, biases and scales, and each of their bits."""
     with pytest.raises(ModelError, match=MESSAGE):
         require_undamaged(flipped(STORED, number, bit), "a.onnx")
 
@@ -58,7 +58,7 @@ def test_the_text_from_which_integers_are_computed_is_covered_too(key: str) -> N
 
 
 def test_files_as_written_pass() -> None:
-    """Shipped files, the network of a sensor, an entry added later, a file without a checksum."""
+    """Shipped files, a sensor's network, one with a later entry and one without checksum pass."""
     for name in shipped_names():
         require_undamaged(load_onnx(SHIPPED / f"{name}{INT8}.onnx"), name)
     require_undamaged(Network.load(NAME, sensor=SENSOR).model, NAME)
@@ -73,12 +73,13 @@ def test_files_as_written_pass() -> None:
 
 @pytest.mark.parametrize("sensor", ["", SENSOR])
 def test_a_damaged_file_restores_nothing(sensor: str, tmp_path: Path) -> None:
-    """Neither as it is stored, nor conditioned on a sensor, whose file would have a new checksum;
-    no kit is made of it, and no gate passes it.
+    """It is refused as it is stored, and conditioned on a sensor, whose file has a new checksum.
+
+    No kit is made from it, and no gate passes it.
     """
     stored = Network.load(NAME, sensor=sensor).model if sensor else STORED
     path = tmp_path / "damaged.onnx"
-    # A layer that no sensor replaces.
+    # No sensor replaces this layer.
     names = [tensor.name for tensor in stored.graph.initializer]
     save_onnx(flipped(stored, names.index("body.0.first.weight"), 0), path)
     image = tmp_path / "image.tif"

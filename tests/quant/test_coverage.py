@@ -1,6 +1,4 @@
-"""The range of samples: right percentiles, recorded and read back, and no claim of a file is
-believed.
-"""
+"""Tests of the samples' range: its percentiles, its record, and records that are invalid."""
 
 from dataclasses import astuple
 
@@ -38,7 +36,7 @@ def test_percentiles_are_those_of_all_pixels_however_they_are_divided(
 
 
 @given(st.lists(st.floats(0, 1), min_size=4, max_size=4), st.floats(0, 1))
-def test_what_is_recorded_is_read_back(values: list[float], saturated: float) -> None:
+def test_a_recorded_range_is_read_back(values: list[float], saturated: float) -> None:
     p1, p50, p99, p99_9 = sorted(values)
     sample_range = SampleRange(p1, p50, p99, p99_9, saturated)
     stored = recorded_range({KEY: sample_range.to_words()})
@@ -67,7 +65,7 @@ def test_a_record_that_makes_no_sense_is_none(text: str) -> None:
     assert recorded_range({}) is None
 
 
-def test_bright_ground_that_nobody_saw_is_named() -> None:
+def test_bright_ground_that_no_sample_shows_is_reported() -> None:
     assert uncovered(FULL, None) == uncovered(FULL, DARK) == ""
     assert "calibration reached 0.30" in uncovered(DARK, DARK)
     assert "nothing brighter was judged" in uncovered(DARK, FULL)

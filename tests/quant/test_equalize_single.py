@@ -1,6 +1,4 @@
-"""Equalising single tensors: the float network stays, the search only gains, most on unequal
-channels.
-"""
+"""Tests that equalising single tensors keeps the float network and reduces the error."""
 
 import numpy as np
 import onnx
@@ -64,7 +62,7 @@ def test_equalizing_leaves_the_float_network_as_it_was(name: str) -> None:
         assert_same(one_alone, graph, host_part)
 
 
-def test_what_others_read_or_factors_do_not_pass_is_left_alone() -> None:
+def test_tensors_that_factors_cannot_pass_are_left_alone() -> None:
     _, graph, _, singles = read("unet")
     pooled = set[str]()
     for op in graph:
@@ -79,7 +77,7 @@ def test_what_others_read_or_factors_do_not_pass_is_left_alone() -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 1.0, 3.0]))
-def test_relu6_is_the_end_of_int8_whatever_the_factors(seed: int, size: float) -> None:
+def test_relu6_becomes_the_end_of_int8_for_any_factors(seed: int, size: float) -> None:
     graph = with_relu6(size)
     host_part = HostPart()
     singles = SingleTensors(tuple(single_tensors(graph)), (5, 5, 4))
@@ -99,9 +97,7 @@ def test_relu6_is_the_end_of_int8_whatever_the_factors(seed: int, size: float) -
 
 
 class Bowl:
-    """A cost that is known: how far the channels of the first tensor are from factors of their own,
-    on two crops.
-    """
+    """A known cost on two crops: the distance of the first tensor's factors from given ones."""
 
     def __init__(self, graph: Graph) -> None:
         self.sizes = self._sizes(graph)
@@ -132,13 +128,13 @@ def test_the_search_never_ends_above_its_start(effort: Effort, most_groups: int)
         assert trial(singles.scaled(graph, factors))(None).sum() <= before
 
 
-@pytest.mark.parametrize("loud", [0.1, 20.0])
-def test_what_calibration_sees_is_not_clipped_where_the_image_itself_passes(
-    loud: float, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("size", [0.1, 20.0])
+def test_calibration_images_are_not_clipped_without_a_global_add(
+    size: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
         "beers_deploy.quant.plan.equalize_single",
-        lambda _g, _c, ranges, *_: loud * FULL / ranges,
+        lambda _g, _c, ranges, *_: size * FULL / ranges,
     )
     model, _, _, singles = read("espcn")
     int8 = quickly(model, patches_of(waves()))
@@ -150,9 +146,7 @@ def test_what_calibration_sees_is_not_clipped_where_the_image_itself_passes(
 def test_unequal_channels_err_half_as_much_once_they_are_equalized(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A network whose channels differ thirtyfold, as training with batch
-    normalisation leaves them.
-    """
+    """Channels differ thirtyfold here, as training with batch normalisation leaves them."""
     network = build("dncnn", torch.Generator().manual_seed(0))
     kinds = torch.nn.Conv2d | torch.nn.BatchNorm2d
     layers = [layer for layer in network.modules() if isinstance(layer, kinds)]

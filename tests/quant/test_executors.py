@@ -1,4 +1,4 @@
-"""C and Aidge compute the integers of the golden vectors, and onnxruntime does but for ties.
+"""Tests that C and Aidge compute the golden integers, and onnxruntime except for ties.
 
 Aidge runs where BEERS_AIDGE_PYTHON names the Python of its environment (`benchmarks.executors`).
 """
@@ -43,7 +43,7 @@ def test_onnxruntime_differs_by_ties_alone(vectors: Vectors) -> None:
     host = vectors.by_onnxruntime_host()
     np.testing.assert_array_equal(host, even[: len(host)])
     assert 0 < vectors.differing(even) < 0.5
-    # The core looks an activation by itself up in a table, which rounds ties up in any case.
+    # The core looks a separate activation up in a table, which rounds ties up in any case.
     if not any(isinstance(op, Pointwise) for op in vectors.core.ops):
         np.testing.assert_array_equal(vectors.by_onnxruntime_board(), even)
 

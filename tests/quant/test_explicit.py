@@ -1,4 +1,4 @@
-"""A board's file leaves nothing to a default, and the rules notice what another file leaves."""
+"""Tests that a board's file leaves nothing to a default, and that the rules find omissions."""
 
 import onnx
 import pytest
@@ -31,13 +31,13 @@ def test_the_file_for_one_tile_states_everything(kind: str, data: st.DataObject)
     onnx.checker.check_model(model, full_check=True)
     attributes, sizes, texts, producer, operators = parts_of(model)
     assert [attributes, sizes, texts, producer] == [[], [], [], []]
-    # What makes the file one of int8 is not in the profile's list yet.
+    # The operators that quantise are not in the profile's list yet.
     assert {"DequantizeLinear", "QuantizeLinear"} <= set(operators)
 
 
 @given(drawn=cores())
 @settings(max_examples=3)
-def test_what_is_left_open_is_named(drawn: tuple[IntCore, int]) -> None:
+def test_each_omission_is_named(drawn: tuple[IntCore, int]) -> None:
     """Each thing that is removed from a file is reported by its name, under its own rule."""
     core, tile_px = drawn
     assert parts_of(board_model(core, {}))[SIZES]

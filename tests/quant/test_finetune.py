@@ -1,6 +1,4 @@
-"""Whole numbers trained with their roundings: nearer to what is wanted, never worse, as legal as
-before.
-"""
+"""Tests that fine-tuning the integers comes nearer to the target, is never worse, stays legal."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -30,11 +28,11 @@ from beers_deploy.quant.passes.scales import moved as moved_tensors
 from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.samples.patches import Patches
 from tests.quant.quick import quickly, without_references
-from tests.quant.trained import hold_to_reference, moved, odd_operations
+from tests.quant.trained import assert_equals_reference, moved, odd_operations
 
 
-def spoilt(core: IntCore) -> IntCore:
-    """A core some of whose weights are off by a few units."""
+def corrupted(core: IntCore) -> IntCore:
+    """Return a core whose weights are off by a few units."""
     generator = np.random.default_rng(5)
 
     ops = list(core.ops)
@@ -58,18 +56,18 @@ def trained(core: IntCore, model: onnx.ModelProto, tuning: Tuning) -> IntCore:
 
 
 def difference(core: IntCore, other: IntCore, patches: Patches) -> float:
-    """Mean squared difference between two cores' corrections."""
+    """Return the mean squared difference between two cores' corrections."""
     return error(core, [(image, correction(other, image)) for image in patches.degraded])
 
 
 def error(core: IntCore, targets: Iterable[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Mean squared difference of the corrections of images from the expected ones."""
+    """Return the mean squared difference between corrections of images and expected ones."""
     errors = [np.square(correction(core, image) - expected).mean() for image, expected in targets]
     return float(np.mean(errors))
 
 
 def test_it_begins_with_the_core_s_own_numbers(quantized: Quantized) -> None:
-    """Without a step of training, the integers are those that went in."""
+    """Without a training step, the integers are those of the core."""
     unchanged = TrainableCore(quantized.core).core()
     for one, other in zip(quantized.core.convolutions, unchanged.convolutions, strict=True):
         np.testing.assert_array_equal(one.weight, other.weight)
@@ -77,7 +75,7 @@ def test_it_begins_with_the_core_s_own_numbers(quantized: Quantized) -> None:
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-def test_odd_operations_are_the_reference_s(seed: int) -> None:
+def test_odd_operations_equal_the_reference(seed: int) -> None:
     """Training computes odd shapes and scales as the integer reference does.
 
     A difference would train another network than the one that runs on the board.
@@ -86,7 +84,9 @@ def test_odd_operations_are_the_reference_s(seed: int) -> None:
     graph = odd_operations(generator)
     bits = {op.output: int(generator.integers(4, 7)) for op in graph} | {PLANES: 7}
     core = build_core(graph, bits)
-    hold_to_reference(moved(core), generator.integers(-128, 128, (1, 3, 12, 10)).astype(np.int8))
+    assert_equals_reference(
+        moved(core), generator.integers(-128, 128, (1, 3, 12, 10)).astype(np.int8)
+    )
 
 
 @pytest.mark.slow
@@ -96,18 +96,18 @@ def test_without_references_it_comes_back_towards_the_float_network(
     """Weights that are off come back towards the float network, on images that were not trained
     on.
     """
-    bad = spoilt(quantized.core)
+    bad = corrupted(quantized.core)
     tuned = trained(bad, float_onnx, Tuning(without_references(patches).pairs, 40, rate=0.1))
     assert difference(tuned, quantized.core, unseen) < 0.7 * difference(bad, quantized.core, unseen)
     assert shift_faults(tuned) == []
 
 
 @pytest.mark.slow
-def test_moved_scales_pay_on_others_and_are_counted(
+def test_moved_scales_improve_unseen_images_and_are_counted(
     float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
 ) -> None:
-    """Scales that are a bit too coarse are moved and counted, and unseen images gain by it."""
-    # All tensors one bit too coarse.
+    """Scales that are a bit too coarse are moved and counted, which improves unseen images."""
+    # All tensors are one bit too coarse.
     plain = quickly(float_onnx, patches)
     bits = {name: n - (name != PLANES) for name, n in plain.core.frac_bits.items()}
     coarse = build_core(plain.graph, bits, host_part=plain.core.host_part)
@@ -121,18 +121,16 @@ def test_moved_scales_pay_on_others_and_are_counted(
 
 @pytest.fixture
 def no_moves(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave all scales, which may gain by themselves."""
+    """Keep all scales, because moving them may gain by itself."""
     name = "beers_deploy.quant.passes.finetune.with_better_scales"
     monkeypatch.setattr(name, lambda trainable, *_: trainable)
 
 
 @pytest.mark.usefixtures("no_moves")
-def test_what_comes_out_worse_is_not_kept(
+def test_a_worse_result_is_discarded(
     quantized: Quantized, float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
-    """Training at an absurd rate returns the core that went in: fine-tuning never makes one
-    worse.
-    """
+    """Training at an absurd rate returns the core unchanged: it is never made worse."""
     tuned = trained(
         quantized.core, float_onnx, Tuning(without_references(patches).pairs, 2, rate=60.0)
     )
@@ -155,10 +153,10 @@ def test_it_goes_on_by_itself_while_held_out_pairs_gain(
     monkeypatch.setattr("beers_deploy.quant.passes.finetune.ROUNDS", (40, 2, 2, 2))
     graph = read_planes(correction_graph(float_onnx))
     tuning = Tuning(without_references(patches).pairs, None, rate)
-    assert finetune(spoilt(quantized.core), graph, tuning)[1] == steps
+    assert finetune(corrupted(quantized.core), graph, tuning)[1] == steps
 
 
-def test_a_reference_of_another_size_is_one_sentence(
+def test_a_reference_of_another_size_is_refused_in_one_sentence(
     quantized: Quantized, float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
     """A reference that does not fit its image is refused with both sizes."""
@@ -176,7 +174,7 @@ def test_the_same_seed_gives_the_same_numbers(
 ) -> None:
     """Two runs of one seed write the same bytes, and report their steps."""
 
-    def made(seed: int) -> bytes:
+    def file_bytes(seed: int) -> bytes:
         """Quantize and fine-tune, and return the file."""
         reported: list[Step] = []
         tuning = Tuning(patches.pairs, 3, rate=0.3, seed=seed)
@@ -187,13 +185,13 @@ def test_the_same_seed_gives_the_same_numbers(
         assert record.startswith(f"3 steps on {len(patches.pairs)} patches, scales of ")
         return bytes(model.host.SerializeToString())
 
-    assert made(1) == made(1)
+    assert file_bytes(1) == file_bytes(1)
 
 
-@pytest.mark.parametrize(("side", "looked_at"), [(4 * BORDER_PX, False), (4 * BORDER_PX - 1, True)])
-def test_the_border_is_the_float_network_s_where_the_reference_cannot_know(
-    side: int, looked_at: bool
-) -> None:
+@pytest.mark.parametrize(
+    ("side", "is_compared"), [(4 * BORDER_PX, False), (4 * BORDER_PX - 1, True)]
+)
+def test_the_target_at_the_border_is_the_float_network(side: int, is_compared: bool) -> None:
     """At the border of a patch the float network is the target, because the reference depends on
     pixels outside of it.
 
@@ -203,21 +201,21 @@ def test_the_border_is_the_float_network_s_where_the_reference_cannot_know(
     edge = inner.clone()
     edge[..., 0, :] += 1
     image = inner.numpy()
-    assert (float(Sample(image, inner, inner, edge, 1.0).error(inner)) > 0) is looked_at
+    assert (float(Sample(image, inner, inner, edge, 1.0).error(inner)) > 0) is is_compared
     assert float(Sample(image, inner, edge, inner, 1.0).error(inner)) > 0
 
 
-def test_slopes_pass_roundings_and_stop_where_int8_ends(
+def test_gradients_pass_roundings_and_stop_where_int8_clips(
     quantized: Quantized, patches: Patches
 ) -> None:
-    """Every layer gets a slope through its roundings, and weights that are clipped get none."""
+    """Every layer gets a gradient through its roundings, and weights that are clipped get none."""
     trainable = TrainableCore(quantized.core)
     encoded = quantized.core.host_part.encode(patches.degraded[0])
     planes = torch.from_numpy(encoded.astype(np.float32))
     trainable(planes).square().mean().backward()
     assert all(bool(weight.grad.abs().max() > 0) for weight in trainable.weights)
     with torch.no_grad():
-        # INT8 ends at 127, so these weights are clipped and get no slope.
+        # INT8 ends at 127, so these weights are clipped and get no gradient.
         trainable.weights[0].fill_(200.0)
     trainable.zero_grad()
     trainable(planes).square().mean().backward()
@@ -229,12 +227,10 @@ def test_slopes_pass_roundings_and_stop_where_int8_ends(
     adds=st.booleans(),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_the_correction_of_a_result_makes_it(
+def test_the_correction_of_a_result_gives_that_result(
     backs: list[tuple[int, bool]], adds: bool, seed: int
 ) -> None:
-    """The correction that is computed from a wanted result gives that result, through any
-    shuffles.
-    """
+    """The correction that is computed from a target gives that target, through any shuffles."""
     generator = np.random.default_rng(seed)
     back = tuple(
         Shuffle(f"s{k}", "a", "b", block, True, order) for k, (block, order) in enumerate(backs)
@@ -246,7 +242,7 @@ def test_the_correction_of_a_result_makes_it(
 
 
 @pytest.mark.slow
-def test_training_on_references_pays_on_others(
+def test_training_on_references_improves_unseen_images(
     quantized: Quantized, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
 ) -> None:
     """Training on references restores unseen images better than the network before."""

@@ -42,9 +42,7 @@ def test_constants_round_half_away_from_zero_and_saturate(value: float, expected
 
 
 def test_the_windows_are_those_of_the_target() -> None:
-    """What is built in, for tests and callers without a board, is what the
-    shipped profile states.
-    """
+    """The built-in windows, for callers without a board, are those of the shipped profile."""
     assert target_shifts(TargetProfile.load("vck190")) == SHIFTS
     with pytest.raises(ProfileError, match="shift_"):
         target_shifts(TargetProfile.load("host-cpu"))

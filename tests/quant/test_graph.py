@@ -108,7 +108,7 @@ def test_one_number_a_channel_behind_an_activation_is_a_convolution(
 @pytest.mark.parametrize(
     "where", ["asymmetric", "half_pixel", "pytorch_half_pixel", "align_corners"]
 )
-def test_a_nearest_resize_is_taken_where_it_makes_blocks(
+def test_a_nearest_resize_is_accepted_where_it_makes_blocks(
     where: str, rounding: str, factor: int
 ) -> None:
     def write(w: GraphWriter) -> None:
@@ -124,8 +124,7 @@ def test_a_nearest_resize_is_taken_where_it_makes_blocks(
     model = behind_conv(write)
     pixels = np.random.default_rng(0).random((1, 1, 5, 7), np.float32)
     result = result_of(open_session(model), pixels)[:, :1]
-    # With aligned corners the places depend on the image's size: right for this one is not right
-    # for all.
+    # With aligned corners the positions depend on the image's size, so a match proves nothing.
     if where != "align_corners" and np.array_equal(
         result, pixels.repeat(factor, 2).repeat(factor, 3)
     ):

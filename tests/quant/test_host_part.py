@@ -1,4 +1,4 @@
-"""The host part: what it encodes is not lost, and its description states it whole."""
+"""Tests that the host part encodes without a loss, and that its description is complete."""
 
 import json
 from itertools import product

@@ -59,8 +59,9 @@ def network(
     adds_image: bool = False,
     limits: tuple[float, float] | None = None,
 ) -> onnx.ModelProto:
-    """Two padded convolutions behind a pixel unshuffle of `block`, the weights of the first times
-    `gains` (C,), those of the last times `out_gains`.
+    """Build two padded convolutions behind a pixel unshuffle of `block`.
+
+    The first one's weights are multiplied by `gains` (C,), the last one's by `out_gains`.
     """
     generator = np.random.default_rng(0)
     w = GraphWriter()
@@ -95,7 +96,7 @@ def network(
 
 
 def shares(channels: int, rows: int = 13, columns: int = 18, count: int = 3) -> list[np.ndarray]:
-    """Images (1, C, rows, columns) in [0, 1]."""
+    """Return images (1, C, rows, columns) in [0, 1]."""
     generator = np.random.default_rng(3)
     images = generator.uniform(0, 1, (count, 1, channels, rows, columns))
     return list(images.astype(np.float32))
@@ -189,7 +190,7 @@ def test_numpy_onnx_and_description_agree(
 ) -> None:
     """NumPy, onnxruntime and the description in the file compute the same for any range and limits.
 
-    A board's host is written from the description alone. Limits of the network are kept.
+    A board's host is written from the description alone. The network's limits are stored in it.
     """
     channels = len(ranges)
     model = network(channels, channels, gains=0.1, adds_image=adds_image, limits=limits)
@@ -213,8 +214,8 @@ def test_numpy_onnx_and_description_agree(
         assert limits[0] <= restored.min() <= restored.max() <= limits[1]
 
 
-def test_limits_are_kept_of_images_in_the_usual_range_too() -> None:
-    """A clip of the network is kept, but for [0, 1], to which whoever stores an image clips it."""
+def test_limits_are_stored_for_images_in_the_usual_range_too() -> None:
+    """The network's clip is stored, except one to [0, 1], which storing an image applies anyway."""
     usual = (0.0, 1.0)
     narrow = (0.25, 0.5)
     assert limits_of(usual) == ()
@@ -222,7 +223,7 @@ def test_limits_are_kept_of_images_in_the_usual_range_too() -> None:
 
 
 def limits_of(limits: tuple[float, float]) -> tuple[float, ...]:
-    """Return the limits that the INT8 network keeps of a network with these."""
+    """Return the limits in the INT8 network of a float network with these limits."""
     int8 = quickly(network(1, 1, limits=limits), patches(shares(1)))
     return int8.core.host_part.clip_limits
 
@@ -252,7 +253,7 @@ def test_figures_do_not_depend_on_the_unit(exponents: list[int], error: float) -
     """
     gains = 2.0 ** np.array(exponents)
     images = shares(len(gains), count=2)
-    # The range that is found is that of all samples.
+    # The range is found from the samples, so one pixel has to reach 1.
     images[0][..., 0, 0] = 1
     figures = []
     count = len(gains)
@@ -310,16 +311,16 @@ def test_the_usual_range_is_none() -> None:
 
 
 @pytest.mark.parametrize("option", ["", "1", "1,0", "0,0", "0,1,2", "0,nan", "0,inf", "0,1e9", 5])
-def test_what_is_no_range_is_refused(option: object) -> None:
+def test_an_invalid_range_is_refused(option: object) -> None:
     """A range that is empty, not finite or too large is refused with the form that is expected."""
     with pytest.raises(OptionError, match="`input_range` must be LOW,HIGH"):
         read_ranges(option, 3)
 
 
-def test_samples_tell_the_range() -> None:
-    """Samples tell the range of each channel that leaves [0, 1].
+def test_samples_determine_the_range() -> None:
+    """The range of each channel that leaves [0, 1] is found from the samples.
 
-    A constant map is a level and no contrast, so samples of constant channels alone are refused.
+    A constant map is a level without contrast, so samples of constant channels alone are refused.
     """
     image = shares(4, 8, 8, 1)[0]
     image[:, 1] = 2 * image[:, 1] - 1
@@ -359,9 +360,9 @@ def test_image_files_are_mapped_onto_a_stated_range(ranges: Ranges) -> None:
 
 
 def test_a_channel_of_zeros_may_be_a_little_below() -> None:
-    """Rounding leaves -1e-8 in a degradation code, of which no scale is needed.
+    """Rounding leaves -1e-8 in a degradation code, which needs no range of its own.
 
-    A channel that reaches as far below as the smallest range has its own.
+    A channel that reaches as far below zero as the smallest range has its own range.
     """
     image = shares(2, 8, 8, 1)[0]
     image[:, 1] = -1e-8
@@ -393,7 +394,7 @@ def test_maps_of_another_unit_are_compared_by_their_own_range(
 
 
 def test_a_result_of_the_images_channels_keeps_the_range_of_the_image() -> None:
-    """An image that a network makes far too bright is an error, and no map of another unit."""
+    """A far too bright image is an error of the network, and not a map of another unit."""
     image = shares(3, 9, 9, 1)[0]
     assert ranges_of_result(100 * image, image, ()) == ()
     assert ranges_of_result(100 * image, image[:, :2], ()) != ()

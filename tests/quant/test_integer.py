@@ -1,6 +1,4 @@
-"""The integer reference: the documented arithmetic, equal to the runtime bit for bit but for tie
-rounding.
-"""
+"""Tests that the integer reference equals the runtime bit for bit, but for rounding of ties."""
 
 from dataclasses import replace
 

@@ -1,9 +1,8 @@
-"""Integer operators are added exactly, in the ways that a processor takes whose fast kernels
-saturate.
+"""Tests that integer operators sum exactly, also on processors whose fast kernels saturate.
 
-The ways are forced, so that they are proven on every processor; where the kernels do saturate,
-leaving them out fails (`test_left_alone_they_saturate_where_the_processor_does`). Filled with
-channels of zeros, a network gives the same numbers.
+The exact graphs are forced, so that every processor tests them. As a control, the plain graphs
+fail where the kernels saturate (`test_plain_graphs_saturate_where_the_processor_does`). Channels
+of zeros that are added to a network change no number.
 """
 
 from pathlib import Path
@@ -36,9 +35,9 @@ from tests.quant.quick import Calibration
 from tests.shipped import shipped_pair
 
 SHAPES = [(1, 1, 1), (3, 5, 3), (4, 6, 1), (16, 16, 3), (5, 33, 3), (32, 8, 2), (17, 32, 3)]
-"""(outputs, inputs, kernel) of convolutions: odd ones straddle what a kernel takes at a time."""
+"""(outputs, inputs, kernel) of convolutions; odd numbers do not fill the blocks of a kernel."""
 GROUPED = [(12, 3, 3, 2), (12, 1, 3, 6)]
-"""The same of one group, and how many there are."""
+"""The same for one group, and then the number of groups."""
 
 
 def convolution(
@@ -48,8 +47,9 @@ def convolution(
     per_channel: bool = False,
     middle: int = 3,
 ) -> onnx.ModelProto:
-    """QLinearConv of images (N, C, H, W) of 8 bits by int8 weights (O, C / groups, k, k),
-    asymmetric, with a bias.
+    """Return an asymmetric QLinearConv with a bias.
+
+    Its images (N, C, H, W) have 8 bits, and its weights (O, C / groups, k, k) are int8.
     """
     outputs = len(weight)
     terms = weight[0].size
@@ -115,7 +115,7 @@ def by_definition(model: onnx.ModelProto, image: np.ndarray) -> np.ndarray:
     seed=st.integers(0, 2**32 - 1),
 )
 @settings(max_examples=60, deadline=None)
-def test_any_convolution_is_added_exactly(
+def test_any_convolution_sums_exactly(
     shape: tuple[int, int, int, int],
     kind: type[np.uint8 | np.int8],
     per_channel: bool,
@@ -136,10 +136,8 @@ def test_any_convolution_is_added_exactly(
         assert np.array_equal(session.run(None, {"image": image})[0], by_definition(model, image))
 
 
-def test_left_alone_they_saturate_where_the_processor_does() -> None:
-    """The control: without the ways the numbers are wrong on such a processor, and right on any
-    other.
-    """
+def test_plain_graphs_saturate_where_the_processor_does() -> None:
+    """As a control, a plain graph is wrong on such a processor, and right on any other."""
     image = np.full((1, 32, 5, 5), 255, np.uint8)
     weight = np.full((16, 32, 3, 3), 127, np.int8)
     model = convolution(weight, np.uint8)
@@ -155,12 +153,10 @@ def test_left_alone_they_saturate_where_the_processor_does() -> None:
     size=st.sampled_from([63, 70, 128]),
 )
 @settings(max_examples=200, deadline=None)
-def test_what_is_proven_holds_for_the_worst_activations(
+def test_the_proof_holds_for_the_worst_activations(
     inputs: int, kernel: int, largest: int, seed: int, size: int
 ) -> None:
-    """Of the pairs that a kernel forms from channel to channel of a tap, and across taps where they
-    are odd.
-    """
+    """A kernel sums pairs of neighbouring channels, and across taps if their number is odd."""
     generator = np.random.default_rng(seed)
     weight = np.clip(
         generator.integers(-size, size + 1, (3, inputs, kernel, kernel)), -128, 127
@@ -181,7 +177,7 @@ SMALL = [shipped_pair(name)[1] for name in ("convbeers-xs", "convbeers-s")]
 
 @pytest.mark.parametrize("path", SMALL, ids=lambda path: path.stem)
 @pytest.mark.parametrize("optimise", [False, True])
-def test_shipped_networks_are_those_of_the_integer_reference(path: Path, optimise: bool) -> None:
+def test_shipped_networks_equal_the_integer_reference(path: Path, optimise: bool) -> None:
     model = load_onnx(path)
     generator = np.random.default_rng(5)
     core = read_core(model)
@@ -194,8 +190,9 @@ def test_shipped_networks_are_those_of_the_integer_reference(path: Path, optimis
 
 @pytest.mark.parametrize("path", SMALL, ids=lambda path: path.stem)
 def test_behind_a_relu_no_weights_saturate(path: Path) -> None:
-    """What keeps INT8 faster than float32: a third of the convolutions, the largest, keep the fast
-    kernels.
+    """The largest convolutions, at least a third, keep the fast kernels.
+
+    This keeps INT8 faster than float32.
     """
     kinds = weight_types(with_exact_sums(load_onnx(path)))
     assert {kind for name, kind in kinds.items() if name.endswith(".second")} == {TensorProto.INT8}
@@ -209,29 +206,29 @@ def weight_types(model: onnx.ModelProto) -> dict[str, int]:
     return {node.name: types[node.input[3]] for node in nodes}
 
 
-def test_a_relu_that_somebody_else_looks_at_is_left_alone() -> None:
-    """A tensor that is wanted as an output is stored as the file says."""
+def test_a_relu_that_is_an_output_is_left_alone() -> None:
+    """An output is stored as the file states."""
     model = load_onnx(SMALL[0])
     relu = next(node.output[0] for node in model.graph.node if node.op_type == "Max")
     model.graph.output.append(helper.make_tensor_value_info(relu, TensorProto.UINT8, None))
     image = np.random.default_rng(0).random((1, 1, 13, 21), dtype=np.float32)
     as_written = open_session(model, 1, exact=False)
-    ways = open_session(model, 1, exact=True)
-    lowest = ways.run([relu], {"image": image})[0].min()
+    exact = open_session(model, 1, exact=True)
+    lowest = exact.run([relu], {"image": image})[0].min()
     assert lowest == as_written.run([relu], {"image": image})[0].min() == 128
 
 
-def test_products_of_matrices_are_added_exactly_too() -> None:
+def test_matrix_products_sum_exactly_too() -> None:
     generator = np.random.default_rng(1)
     weight = generator.choice([-128, 127], (33, 17)).astype(np.int8)
     image = generator.choice([0, 255], (5, 33)).astype(np.uint8)
-    given_, sums_info = (
+    image_in, sums_out = (
         helper.make_tensor_value_info(name, kind, None)
         for name, kind in (("image", TensorProto.UINT8), ("sums", TensorProto.INT32))
     )
     node = helper.make_node("MatMulInteger", ["image", "weight"], ["sums"])
     initializers = [numpy_helper.from_array(weight, "weight")]
-    graph = helper.make_graph([node], "one", [given_], [sums_info], initializers)
+    graph = helper.make_graph([node], "one", [image_in], [sums_out], initializers)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     sums = open_session(model, 1, exact=True).run(None, {"image": image})[0]
     assert np.array_equal(sums, image.astype(np.int64) @ weight.astype(np.int64))
@@ -251,16 +248,14 @@ def test_weights_that_are_computed_are_refused_in_a_sentence() -> None:
 @pytest.mark.parametrize("activations", [QuantType.QUInt8, QuantType.QInt8])
 @pytest.mark.parametrize("per_channel", [False, True])
 @pytest.mark.parametrize("form", [QuantFormat.QOperator, QuantFormat.QDQ])
-def test_files_of_other_makers_give_the_same_numbers_in_these_ways(
+def test_files_of_other_quantizers_give_the_same_numbers(
     form: QuantFormat,
     per_channel: bool,
     activations: QuantType,
     float_onnx: onnx.ModelProto,
     tmp_path: Path,
 ) -> None:
-    """Asymmetric activations, float scales; QDQ as the integer operators that the runtime makes of
-    it.
-    """
+    """Activations are asymmetric, scales are float, and the runtime fuses QDQ to integers."""
     options = {
         "quant_format": form,
         "per_channel": per_channel,
@@ -276,11 +271,13 @@ def test_files_of_other_makers_give_the_same_numbers_in_these_ways(
     exact = with_exact_sums(theirs)
     assert exact.graph.node != theirs.graph.node
     image = np.random.default_rng(1).integers(0, 2, (1, 1, 31, 45)).astype(np.float32)
-    ways = run(open_session(theirs, 1, exact=True), image)
+    result = run(open_session(theirs, 1, exact=True), image)
     if form is QuantFormat.QOperator:
-        assert np.array_equal(ways, run(open_session(theirs, 1, optimise=False, exact=True), image))
+        assert np.array_equal(
+            result, run(open_session(theirs, 1, optimise=False, exact=True), image)
+        )
     if int8_adds_exactly():
-        assert np.array_equal(ways, run(open_session(theirs, 1), image))
+        assert np.array_equal(result, run(open_session(theirs, 1), image))
 
 
 def shapes_of_weights(model: onnx.ModelProto) -> list[tuple[int, ...]]:
@@ -289,7 +286,7 @@ def shapes_of_weights(model: onnx.ModelProto) -> list[tuple[int, ...]]:
 
 
 def as_written(model: onnx.ModelProto, image: np.ndarray) -> np.ndarray:
-    """On a session of onnxruntime's own, which nobody rewrites a model for."""
+    """Run a model in a plain session of onnxruntime, for which it is not rewritten."""
     session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     return np.asarray(session.run(None, {"image": image})[0])
 
@@ -313,12 +310,10 @@ def test_no_convolution_stays_narrow_and_the_numbers_are_the_same(path: Path) ->
     ("middle", "opset", "shape"),
     [(0, 17, (FEWEST_OUTPUTS, 4, 1, 1)), (3, 17, (1, 2, 1, 1)), (0, 10, (1, 2, 1, 1))],
 )
-def test_one_output_is_filled_where_a_stored_zero_is_a_weight_of_zero(
+def test_one_output_is_padded_where_a_stored_zero_is_a_weight_of_zero(
     middle: int, opset: int, shape: tuple[int, ...]
 ) -> None:
-    """Its bias has one number, as a scale for the whole tensor might; older opsets cannot be
-    filled.
-    """
+    """Its bias has one number, as a scale per tensor may have. Older opsets cannot be padded."""
     model = convolution(np.array([[[[1]], [[-2]]]], np.int8), np.uint8, middle=middle)
     model.opset_import[0].version = opset
     image = np.random.default_rng(0).integers(0, 256, (1, 2, 3, 5)).astype(np.uint8)

@@ -1,6 +1,4 @@
-"""Calibration and gate patches cover the sensor's range in the stated shares, and scales hold
-ground that is brighter than a user's own samples.
-"""
+"""Tests that patches cover the sensor's range, and that scales fit ground brighter than samples."""
 
 from collections import Counter
 from dataclasses import replace
@@ -73,7 +71,7 @@ def test_ground_without_light_stays_finite(name: str) -> None:
 
 
 def test_default_patches_cover_the_range_and_those_of_the_gate_as_well() -> None:
-    """As scenes are drawn, 99.9 % of their pixels lie in the lower half of the range."""
+    """Without relighting, 99.9 % of a scene's pixels lie in the lower half of the range."""
     calibration = Calibration(SENSOR, None, patches=32, patch_px=48, seed=0)
     for patches in (calibration.drawn, unseen_patches(SENSOR, None, 32, 0)):
         sample_range = range_from(sum(map(histogram, patches.degraded), np.zeros(1)))
@@ -81,7 +79,7 @@ def test_default_patches_cover_the_range_and_those_of_the_gate_as_well() -> None
         assert sample_range.p1 < 0.05
 
 
-def test_light_changes_nothing_but_the_light() -> None:
+def test_lightings_change_the_exposure_alone() -> None:
     scenes = [procedural_scene(500, 520, np.random.default_rng(1))]
     lit, plain = (
         draw_patches(scenes, SENSOR, REFERENCE, 16, 3, 40, lightings=lightings)
@@ -99,7 +97,7 @@ def test_light_changes_nothing_but_the_light() -> None:
 
 
 def test_scales_hold_ground_that_is_brighter_than_the_samples() -> None:
-    """Behind HardSwish no factor of the search is passed on, so that its scales alone can hold it.
+    """Factors of the search do not pass HardSwish, so scales alone can prevent clipping.
 
     The samples have a tenth of the light of the image that is judged.
     """

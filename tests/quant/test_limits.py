@@ -1,4 +1,4 @@
-"""Limits of a gate: read from a file or given, and refused where no network can break them."""
+"""Tests that a gate's limits are read, and refused where no network can break them."""
 
 import math
 from dataclasses import replace
@@ -39,13 +39,13 @@ def test_a_limit_that_no_network_breaks_is_refused(name: str, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(("name", "value"), [("mae", 0.5), ("p999", 1.1), ("saturated", 2.0)])
-def test_a_limit_that_a_black_image_keeps_is_refused(name: str, value: float) -> None:
-    """By values of its own, because the table of the bounds may be wrong itself."""
+def test_a_limit_that_a_black_image_meets_is_refused(name: str, value: float) -> None:
+    """The values are written out, because the table of the bounds may be wrong itself."""
     with pytest.raises(OptionError, match="broken network"):
         limits_of({name: value})
 
 
-NO_LIMITS = [
+INVALID = [
     "mae = 'small'",
     "mae = true",
     "mea = 0.1",
@@ -59,9 +59,9 @@ NO_LIMITS = [
 
 
 @pytest.mark.parametrize(
-    "text", [*NO_LIMITS, "mae = [1]", "mae = 0x" + "f" * 400, "mae = " + "9" * 5000]
+    "text", [*INVALID, "mae = [1]", "mae = 0x" + "f" * 400, "mae = " + "9" * 5000]
 )
-def test_limits_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
+def test_invalid_limits_are_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "gate.toml").write_text(text)
     with pytest.raises(OptionError, match=r"gate\.toml(?!.*sys\.set).* mae\b"):
         limits_of(tmp_path / "gate.toml")

@@ -1,4 +1,4 @@
-"""What a user measures results by, and the gate that limits it."""
+"""Tests of the metrics of a user's results, and of the gate that limits their loss."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from examples.networks import build, to_onnx
 from tests.quant.quick import one_guess, patches_of
 
 
-def test_images_are_measured_as_everywhere_else() -> None:
+def test_each_metric_is_computed_as_everywhere_else() -> None:
     result, reference = np.random.default_rng(0).random((2, 1, 2, 23, 31))
     expected = {
         "psnr": psnr_db(result, reference, 1.0),
@@ -31,7 +31,7 @@ def test_references_of_another_size_are_refused() -> None:
         metric_value("psnr", np.zeros((1, 2, 23, 31)), np.zeros((1, 2, 23, 30)))
 
 
-def test_a_gate_limits_what_a_metric_loses() -> None:
+def test_a_gate_limits_the_loss_of_a_metric() -> None:
     network = bd.Network.load(to_onnx("dncnn", build("dncnn", torch.Generator().manual_seed(0))))
     images = np.random.default_rng(0).random((12, 1, 32, 32), dtype=np.float32)
     noise = np.random.default_rng(1).normal(0, 0.02, images.shape)

@@ -1,4 +1,4 @@
-"""Sizes behind a window, and moves of pixels, are those of onnx's own runtimes."""
+"""Tests that sizes behind windows, and moves of pixels, are those of onnx's own runtimes."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from tests.quant.tiling.small_networks import Row, taps
 
 @st.composite
 def with_offset_windows(draw: st.DrawFn) -> Row:
-    """A transposed convolution, one with automatic padding, or a pool."""
+    """Draw a transposed convolution, one with automatic padding, or a pool."""
     pairs = st.tuples(*[st.integers(1, 3)] * 2)
     kernel = draw(pairs)
     strides = draw(pairs)

@@ -1,6 +1,4 @@
-"""Networks of odd shapes, a few operations each: right in INT8 and without faults, or refused by
-the node's name.
-"""
+"""Tests that small unusual networks are correct in INT8, or refused by the node's name."""
 
 from collections.abc import Mapping
 
@@ -17,7 +15,7 @@ from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.structure import saturated_shares, structure_checks
 from tests.quant.quick import patches_of
 from tests.quant.simplify.networks import parsed, single
-from tests.quant.trained import hold_to_reference, moved
+from tests.quant.trained import assert_equals_reference, moved
 
 NUMBERS = {
     "zero": 0.0,
@@ -44,9 +42,9 @@ def sketch(
     Args:
         nodes: in ONNX's text format; layer a reads the weights a_w and the bias a_b.
         outputs: the number of channels of the result.
-        side: of the image, if it is fixed.
+        side: the image's side in pixels, if it is fixed.
         sizes: the standard deviation of a layer's weights, if it is not 0.3.
-        shapes: of the weights of each layer; those of `up` are of a transposed convolution.
+        shapes: the shape of each layer's weights; `up` is a transposed convolution.
     """
     ends = f"float[N,1,{side},{side}] in => float[N,{outputs},P,Q] out"
     model = parsed(nodes, ends, constants=NUMBERS)
@@ -57,7 +55,7 @@ def sketch(
             generator = np.random.default_rng(number)
             weight = (sizes or {}).get(name, 0.3) * generator.standard_normal(shapes[name])
             bias = 0.1 * generator.standard_normal(shapes[name][name == "up"])
-            # The second channel and the fourth one of such a layer never exceed zero.
+            # The second and the fourth channel of such a layer never exceed zero.
             bias = DEAD if node.input[2] == "dead_b" else bias
             values = zip(node.input[1:], (weight, bias), strict=True)
             stored.extend(
@@ -221,7 +219,7 @@ VALID = {
 
 
 @pytest.mark.parametrize("name", VALID)
-def test_near_float_equal_to_the_reference_and_without_faults(name: str) -> None:
+def test_int8_is_near_float_equals_the_reference_and_has_no_faults(name: str) -> None:
     model = VALID[name]
     # A network that pools over the whole image has one size.
     height_px = model.graph.input[0].type.tensor_type.shape.dim[2].dim_value or 48
@@ -236,7 +234,7 @@ def test_near_float_equal_to_the_reference_and_without_faults(name: str) -> None
     actual = result_of(open_session(int8.host), samples[1])
     assert np.abs(actual - expected).mean() < 0.06 * expected.std()
     assert not any(layer.unequal for layer in agreement(int8.core, int8.host, samples[2]).layers)
-    hold_to_reference(moved(int8.core), int8.core.host_part.encode(samples[2]))
+    assert_equals_reference(moved(int8.core), int8.core.host_part.encode(samples[2]))
     assert [str(check) for check in structure_checks(model, int8.host) if not check.passed] == []
     assert saturated_shares(int8.host, samples).get("correction", 0) < 0.01
 
@@ -265,6 +263,6 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("message", REFUSED)
-def test_what_would_be_computed_wrongly_is_refused(message: str) -> None:
+def test_networks_that_would_be_computed_wrongly_are_refused(message: str) -> None:
     with pytest.raises(ModelError, match=message):
         read_network(REFUSED[message])

@@ -1,4 +1,4 @@
-"""The passes: each leaves the float network as it was, and does to the integer one what it says."""
+"""Tests that passes keep the float network and have their effect on the INT8 network."""
 
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -86,9 +86,7 @@ def test_ranges_are_equalized_to_the_group_s_own(graph: Graph, patches: Patches)
 
 
 def skipping(seed: int = 0) -> Graph:
-    """A sum that a pool, an enlargement and a concat hand on, behind a ReLU6; and what is pooled
-    and written anew.
-    """
+    """Build a graph that pools and enlarges a sum behind a ReLU6, and concatenates both."""
     generator = np.random.default_rng(seed)
 
     def conv(
@@ -147,7 +145,7 @@ def test_a_group_goes_through_activations_in_proportion_to_their_input(
         np.testing.assert_allclose(correction(scaled), correction(graph), atol=2e-6)
 
 
-def test_a_tensor_that_would_have_two_places_is_in_no_group() -> None:
+def test_a_tensor_with_two_positions_in_a_concat_is_in_no_group() -> None:
     *before, join, last = skipping()
     assert isinstance(last, Conv)
     twice = replace(join, inputs=("sum", "sum"))  # type: ignore[type-var]
@@ -158,7 +156,7 @@ def test_a_tensor_that_would_have_two_places_is_in_no_group() -> None:
 
 
 @pytest.mark.parametrize(("bits", "beyond"), [(5, False), (4, True)])
-def test_sums_beyond_a_relu6_are_told_by_their_scale(bits: int, beyond: bool) -> None:
+def test_the_scale_of_sums_shows_that_they_exceed_a_relu6(bits: int, beyond: bool) -> None:
     graph = skipping()
     frac_bits = dict.fromkeys(group_of(graph), 5) | {"sum": bits}
     assert exceeds_six(graph, group_of(graph), frac_bits) is beyond
@@ -176,9 +174,9 @@ RANGES = np.geomspace(1, 0.05, 8)
 def searched(
     graph: Graph, weights: np.ndarray, most_groups: int = 8
 ) -> tuple[list[float], float, list[int]]:
-    """What each first guess costs, what the search ends at, and how many crops each trial ran on.
+    """Return the cost of each first guess, the final cost, and the number of crops of each trial.
 
-    The cost on each crop is known: how far the channels are from factors of their own, times the
+    The cost on a crop is known: the distance of the channels' factors from given ones, times the
     crop's weight.
     """
     sizes = np.abs(graph[0].weight).sum((1, 2, 3))  # type: ignore[attr-defined]
@@ -221,7 +219,7 @@ def test_the_search_ends_below_its_best_guess_and_drops_a_trial_that_fails_on_it
 
 
 def test_more_groups_of_channels_try_more_and_never_end_higher(graph: Graph) -> None:
-    """Without any, the search ends with the best guess."""
+    """Without groups, the search ends with the best first guess."""
     stage = Stage(group_of(graph), FIRST_GUESSES, len(RANGES))
     guesses, best, runs = searched(graph, np.arange(1.0, CROPS + 1), 0)
     assert (best, len(runs)) == (min(guesses), FIRST_GUESSES)
@@ -235,9 +233,7 @@ def test_more_groups_of_channels_try_more_and_never_end_higher(graph: Graph) -> 
 
 
 def test_a_trial_that_the_costliest_crops_favour_still_has_to_win_on_all(graph: Graph) -> None:
-    """What the first crops call better and the others worse is not taken: the last look knows no
-    margin.
-    """
+    """A trial that wins on the first crops and loses on all is rejected, without any margin."""
     guesses, cost, _ = searched(graph, np.array([3.0, 2.0, -1.0, -2.0, -3.0]))
     assert cost <= guesses[0]
 
@@ -255,7 +251,7 @@ def test_the_second_gain_is_the_same_correction_coarser(graph: Graph) -> None:
     np.testing.assert_allclose(both[:, 1:] * GAIN, correction(graph), atol=1e-6)
 
 
-def test_the_fine_gain_is_believed_until_its_end() -> None:
+def test_the_fine_copy_is_used_until_it_saturates() -> None:
     scale = 2.0**-11
     fine = np.array([0, 126, -126, 127, -127, -128]) * scale
     coarse = np.array([50, 51, 52, 53, -54, -55]) * scale
@@ -290,7 +286,7 @@ def test_each_step_is_named(float_onnx: onnx.ModelProto, patches: Patches) -> No
 
 
 def one_scale() -> AbstractContextManager[object]:
-    """One scale for each residual group, even if scales of their own err less."""
+    """Force one scale for each residual group, even if separate scales err less."""
     return patch.object(CropTrials, "error", return_value=0.0)
 
 
@@ -318,7 +314,7 @@ def test_sums_that_grow_by_far_have_scales_of_their_own(patches: Patches) -> Non
 
 
 def test_a_small_tensor_of_a_group_has_a_finer_scale(patches: Patches) -> None:
-    """What is magnified right behind it, as by a normalisation, would magnify its steps."""
+    """A layer that amplifies the tensor, as a normalisation does, would amplify its rounding."""
     generator = np.random.default_rng(0)
     weights = {
         "head_w": generator.normal(0, 0.1, (4, 1, 3, 3)),

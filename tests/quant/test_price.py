@@ -1,6 +1,4 @@
-"""The price of each restriction of a DPU: nothing where it restricts nothing, and the integers'
-own loss at the end.
-"""
+"""Tests that the prices of a DPU's restrictions sum to the loss of INT8."""
 
 from dataclasses import replace
 
@@ -63,7 +61,7 @@ def test_simulated_integers_are_those_of_the_network(quantized: Quantized, unsee
     assert simulated.drop_db == pytest.approx(written.drop_db, abs=0.02)
 
 
-def test_of_many_bits_nothing_is_lost(
+def test_with_many_bits_nothing_is_lost(
     quantized: Quantized, unseen: Patches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With 18 bits instead of 8 the steps of the float network lose almost nothing.
@@ -84,7 +82,7 @@ def float_errors(quantized: Quantized, unseen: Patches) -> dict[str, float]:
 
 
 def with_equal_channels(quantized: Quantized) -> Quantized:
-    """The network with weights of each output channel that reach as far."""
+    """Return the network with weights of the same range in each output channel."""
 
     ops = list(quantized.network.graph)
     for place, op in enumerate(ops):
@@ -115,7 +113,7 @@ def test_without_references_prices_are_differences_of_the_mae(
     assert sum(prices(rows[:-1]).values()) == pytest.approx(rows[-2].figures["MAE"].value)
 
 
-def test_what_clips_nothing_pays_nothing_for_it_and_what_clips_much_does(
+def test_clipping_costs_nothing_where_nothing_is_clipped_and_much_elsewhere(
     float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
     """The price of clipping is near 0 for scales that clip nothing, and most of the loss for

@@ -16,7 +16,7 @@ from beers_deploy.quant.session import open_session
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 
 
-def test_scales_are_powers_of_two_and_numbers_are_int8(quantized: Quantized) -> None:
+def test_scales_are_powers_of_two_and_weights_are_int8(quantized: Quantized) -> None:
     for model in (quantized.host, board_model(quantized.core, {})):
         for name, value in constants(model).items():
             if name.startswith("scale_"):
@@ -59,14 +59,14 @@ def test_the_same_patches_give_the_same_bytes(
     assert repeated.host.SerializeToString() == quantized.host.SerializeToString()
 
 
-def test_the_file_says_what_it_was_calibrated_on(quantized: Quantized, patches: Patches) -> None:
+def test_the_file_records_its_calibration(quantized: Quantized, patches: Patches) -> None:
     about = metadata(quantized.host)
     assert about["calibration_sha256"] == patches.digest
     assert about["precision"] == "int8 legal"
 
 
 @pytest.mark.parametrize("encoding", ["float", "host", "board"])
-def test_the_radius_is_read_from_the_graph(
+def test_the_halo_is_read_from_the_graph(
     encoding: str, float_onnx: onnx.ModelProto, quantized: Quantized
 ) -> None:
     board = board_model(quantized.core, {})

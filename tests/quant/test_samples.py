@@ -1,4 +1,4 @@
-"""A user's own samples: read as the network takes them, cut, split, or refused in a sentence."""
+"""Tests that a user's own samples are read, cut and split, or refused in a sentence."""
 
 import os
 from collections.abc import Callable
@@ -24,9 +24,8 @@ ONE_CHANNEL = RAMP[:, :1]
 NO_REFERENCE = np.empty(0, np.float32)
 
 
-def test_large_samples_are_cut_to_patches_on_the_lattice(tmp_path: Path) -> None:
-    """Large samples are cut to patches of 128 pixels, small ones to whole steps of the network's
-    lattice.
+def test_samples_are_cut_to_patches_of_aligned_sides(tmp_path: Path) -> None:
+    """Large samples are cut to patches of 128 pixels, small ones to multiples of the alignment.
 
     A network of a fixed size gets every tile of its size.
     """
@@ -72,10 +71,10 @@ def test_a_folder_holds_images_and_arrays(
     np.testing.assert_array_equal(second[0], array)
 
 
-def test_every_fourth_sample_is_kept_from_calibration(tmp_path: Path) -> None:
-    """Every fourth sample is held out from calibration, so that the judgement is on unseen images.
+def test_every_fourth_sample_is_held_out_from_calibration(tmp_path: Path) -> None:
+    """Every fourth sample is held out from calibration, so that INT8 is judged on unseen images.
 
-    Of fewer than four samples all are used for both, because there would be nothing to judge on.
+    Fewer than four samples are all used for both, because none would be left to judge on.
     """
     levels = np.arange(9, dtype=np.float32) / 9
     steps = np.broadcast_to(levels[:, None, None, None], (9, 1, 8, 8)).copy()
@@ -91,9 +90,7 @@ def test_every_fourth_sample_is_kept_from_calibration(tmp_path: Path) -> None:
 
 
 def test_samples_without_contrast_are_left_out() -> None:
-    """A constant sample tells nothing of a restoration, so it is left out, and refused if it is
-    alone.
-    """
+    """A constant sample says nothing about a restoration: it is left out, or refused if alone."""
     flat = np.full((1, 20, 30), 0.5, np.float32)
     constant = (flat, NO_REFERENCE)
     textured = (ONE_CHANNEL[0, :, :20, :30], NO_REFERENCE)
@@ -103,7 +100,7 @@ def test_samples_without_contrast_are_left_out() -> None:
         read_samples([constant], 1, None)
 
 
-def of(array: np.ndarray) -> Callable[[Path], Path]:
+def array_file(array: np.ndarray) -> Callable[[Path], Path]:
     """Return a writer of an array."""
     return lambda folder: stored(folder / "x.npy", array)
 
@@ -149,12 +146,12 @@ def cut_off(folder: Path) -> Path:
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        (of(RAMP), "reads 1 channels of numbers.*has 2"),
-        (of(ONE_CHANNEL * 3e5), "a range of 0 to .*Divide them by full scale"),
-        (of(np.full((1, 1, 9, 9), np.nan)), "81 values that are NaN or infinite"),
-        (of(RAMP[0, 0]), "a batch of"),
-        (of(ONE_CHANNEL[..., :3, :3]), "at least 4 pixels a side, got 3 x 3"),
-        (of(ONE_CHANNEL[:0]), "contains no sample"),
+        (array_file(RAMP), "reads 1 channels of numbers.*has 2"),
+        (array_file(ONE_CHANNEL * 3e5), "a range of 0 to .*Divide them by full scale"),
+        (array_file(np.full((1, 1, 9, 9), np.nan)), "81 values that are NaN or infinite"),
+        (array_file(RAMP[0, 0]), "a batch of"),
+        (array_file(ONE_CHANNEL[..., :3, :3]), "at least 4 pixels a side, got 3 x 3"),
+        (array_file(ONE_CHANNEL[:0]), "contains no sample"),
         (pickled, r"x\.npy cannot be read as samples"),
         (two_arrays, "got first, second"),
         (cut_off, r"x\.npz cannot be read as samples"),
@@ -172,7 +169,7 @@ def cut_off(folder: Path) -> Path:
         (lambda folder: folder, "contains no sample"),
     ],
 )
-def test_what_are_no_samples_is_refused(
+def test_invalid_samples_are_refused(
     write: Callable[[Path], Path], message: str, tmp_path: Path
 ) -> None:
     """Every kind of wrong input is refused with a message about its own fault, not with a

@@ -1,4 +1,4 @@
-"""What comes to the ends of 8 bits is counted, in any encoding, and what is no loss is not."""
+"""Tests that values clipped at the ends of 8 bits are counted in any encoding."""
 
 from collections.abc import Callable
 
@@ -50,7 +50,7 @@ def rounded(nodes: str, scale: float, zero_point: np.ndarray | None) -> onnx.Mod
     ],
     ids=["int8", "uint8 around 128", "uint8 from 0", "no zero point", "a ReLU reads it"],
 )
-def test_shares_are_those_of_the_values(
+def test_shares_are_those_of_the_clipped_values(
     zero_point: np.ndarray | None, relu: bool, expected_lost: Lost
 ) -> None:
     nodes = RELU if relu else QDQ
@@ -65,9 +65,7 @@ def test_shares_are_those_of_the_values(
 
 
 def test_a_relu_between_two_roundings_reads_the_first() -> None:
-    """QuantizeLinear, DequantizeLinear, Relu, QuantizeLinear: what is below
-    zero was to be cut off.
-    """
+    """Values below zero are no loss, because the Relu behind DequantizeLinear would clip them."""
     model = rounded(TWICE, 1 / 400, np.array(0, np.int8))
     signed = (IMAGE - 0.5) * 2
     shares = saturated_shares(model, [signed])

@@ -1,4 +1,4 @@
-"""Each pass can be left out by an argument, and each one has an effect."""
+"""Tests that each pass can be left out, and that each one has an effect."""
 
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -24,7 +24,7 @@ Results = Callable[[Passes], list[np.ndarray]]
 
 
 def waves(phase: int) -> np.ndarray:
-    """An image (1, 1, H, W) of waves with few bright points: to clip these costs least."""
+    """Return an image (1, 1, H, W) of waves with few bright points, which are cheap to clip."""
     rows, columns = np.mgrid[:48, :36] / 40
     image = 0.3 + 0.1 * np.sin(7 * rows + phase) * np.cos(5 * columns)
     image[5::16, 7::12] = 1.0
@@ -53,8 +53,9 @@ class Distilling(nn.Module):
 
 @pytest.fixture(scope="module")
 def results(float_onnx: onnx.ModelProto) -> Results:
-    """What three networks restore once quantised: one adds to the image, through another it passes
-    itself, and one is a distillation network.
+    """Return a function that quantises three networks and returns their results.
+
+    One adds to the image, one computes the whole image, and one is a distillation network.
     """
     distilling = simplify(to_onnx("dncnn", Distilling()), "distilling")
     patches = patches_of([waves(phase) for phase in range(3)])
@@ -73,9 +74,9 @@ def with_all(results: Results) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("name", [field.name for field in fields(Passes)])
-def test_each_pass_can_be_left_out_and_then_the_integers_are_others(
+def test_each_pass_can_be_left_out_and_has_an_effect(
     name: str, results: Results, with_all: list[np.ndarray]
 ) -> None:
-    """On one of the networks at least: no pass serves all."""
+    """At least one of the networks must change, because no pass serves all of them."""
     without = results(replace(ALL, **{name: False}))
     assert any((one != other).any() for one, other in zip(with_all, without, strict=True))

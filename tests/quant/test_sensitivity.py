@@ -1,4 +1,4 @@
-"""Error attribution: each layer by itself, against the networks that it stands for."""
+"""Tests that a network's error is attributed to its layers."""
 
 import math
 from dataclasses import replace
@@ -20,7 +20,7 @@ from beers_deploy.quant.session import few_crops, open_session, result_of, run
 from tests.quant.quick import patches_of, quickly, without_references
 from tests.quant.simplify.networks import parsed
 
-SPOILT = "body.1.second"
+CORRUPTED = "body.1.second"
 
 
 @pytest.fixture(scope="module")
@@ -32,17 +32,17 @@ def crops(patches: Patches) -> list[np.ndarray]:
 def differences_of(
     int8: Quantized, float_onnx: onnx.ModelProto, crops: list[np.ndarray]
 ) -> list[np.ndarray]:
-    """Return INT8 less float for each crop, both clipped as `restore` clips them."""
+    """Return INT8 minus float for each crop, both clipped as `restore` clips them."""
     in_float = open_session(float_onnx)
     in_int8 = open_session(int8.host)
     # The INT8 file clips its result itself.
     return [run(in_int8, crop) - run(in_float, crop).clip(0, 1) for crop in crops]
 
 
-def test_layers_lose_together_what_the_int8_file_loses_and_adds_hardly_anything(
+def test_the_errors_of_layers_sum_to_that_of_the_int8_file_and_adds_hardly_err(
     float_onnx: onnx.ModelProto, quantized: Quantized, crops: list[np.ndarray]
 ) -> None:
-    """Their squared errors nearly add up; adds of a shared residual scale lose what saturates."""
+    """Squared errors nearly add up. Adds of a shared residual scale err by saturation alone."""
     layers, together = layer_errors(quantized.graph, quantized.core, crops)
     differences = np.concatenate(differences_of(quantized, float_onnx, crops))
     assert together.mae == pytest.approx(float(np.abs(differences).mean()), rel=1e-3)
@@ -74,50 +74,52 @@ def test_an_image_that_is_added_before_a_pixel_shuffle_is_no_error(
 
 
 @pytest.fixture(scope="module")
-def spoilt(quantized: Quantized) -> Quantized:
-    """The weights of one layer lose their sign."""
+def corrupted(quantized: Quantized) -> Quantized:
+    """Return the network with the weights of one layer negated."""
     ops = list(quantized.core.ops)
     for place, op in enumerate(ops):
-        if op.name == SPOILT and isinstance(op, IntConv):
+        if op.name == CORRUPTED and isinstance(op, IntConv):
             ops[place] = replace(op, weight=-op.weight)
     core = replace(quantized.core, ops=tuple(ops))
     return replace(quantized, core=core, host=host_model(core, {}))
 
 
-def test_what_is_lost_is_told_and_of_much_also_where(
-    float_onnx: onnx.ModelProto, spoilt: Quantized, patches: Patches
+def test_the_loss_is_reported_and_a_large_one_with_its_layer(
+    float_onnx: onnx.ModelProto, corrupted: Quantized, patches: Patches
 ) -> None:
     """The sentence about the loss names the layer that errs most if the loss is large.
 
     It advises fine-tuning then, but not for a network that is fine-tuned already.
     """
-    gate = compare(open_session(float_onnx), open_session(spoilt.host), patches)
+    gate = compare(open_session(float_onnx), open_session(corrupted.host), patches)
     assert gate.worst_drop_db > gate.drop_db
     slight = replace(gate, psnr_float_db=40.0, psnr_int8_db=39.9, worst_drop_db=2.0)
-    assert losses(spoilt, slight, patches) == (
+    assert losses(corrupted, slight, patches) == (
         "INT8 loses 0.10 dB of 40.00, and 2.00 dB where most (6 simulated patches of 128 x 128)"
     )
     strong = replace(slight, psnr_int8_db=39.6)
-    much = losses(spoilt, strong, patches)
-    layers, _ = layer_errors(spoilt.graph, spoilt.core, few_crops(patches.degraded, spoilt.host))
+    much = losses(corrupted, strong, patches)
+    layers, _ = layer_errors(
+        corrupted.graph, corrupted.core, few_crops(patches.degraded, corrupted.host)
+    )
     worst = max(layers, key=lambda layer: layer.network.squared)
     assert f": most of it in {worst.name} (" in much
     assert much.endswith("; try `finetune` auto")
     without = replace(gate, psnr_float_db=math.nan)
-    assert losses(spoilt, without, patches).endswith("references are not of the result's size")
-    assert losses(spoilt, without, without_references(patches)).endswith("patches of 128 x 128)")
-    tuned = replace(spoilt, host=host_model(spoilt.core, {"finetune": "3 steps"}))
+    assert losses(corrupted, without, patches).endswith("references are not of the result's size")
+    assert losses(corrupted, without, without_references(patches)).endswith("patches of 128 x 128)")
+    tuned = replace(corrupted, host=host_model(corrupted.core, {"finetune": "3 steps"}))
     drop = replace(gate, psnr_float_db=40.0, psnr_int8_db=39.6)
     assert losses(tuned, drop, patches).endswith(" %)")
 
 
-def test_a_spoilt_layer_is_found(spoilt: Quantized, crops: list[np.ndarray]) -> None:
-    """It, and no other, gets the error."""
-    layers, _ = layer_errors(spoilt.graph, spoilt.core, crops)
+def test_a_corrupted_layer_is_found(corrupted: Quantized, crops: list[np.ndarray]) -> None:
+    """The error is attributed to this layer and to no other."""
+    layers, _ = layer_errors(corrupted.graph, corrupted.core, crops)
     worst = min(layers, key=lambda layer: layer.alone.sqnr_db)
-    assert worst.name == SPOILT
+    assert worst.name == CORRUPTED
     assert worst.alone.sqnr_db < 0
-    assert all(layer.alone.sqnr_db > 10 for layer in layers if layer.name != SPOILT)
+    assert all(layer.alone.sqnr_db > 10 for layer in layers if layer.name != CORRUPTED)
 
 
 def test_one_gain_is_attributed_as_two_are(

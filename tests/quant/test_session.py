@@ -1,4 +1,4 @@
-"""What a session does beside its results."""
+"""Tests of a session's threads."""
 
 import time
 
@@ -12,16 +12,14 @@ IMAGE = np.full((1, 1, 96, 96), 0.5, np.float32)
 
 
 def idle_cpu_s(wait_s: float) -> float:
-    """What this process takes of the processor while it does nothing."""
+    """Return the CPU time that this process uses while it sleeps."""
     begun = time.process_time()
     time.sleep(wait_s)
     return time.process_time() - begun
 
 
-def test_a_session_that_has_run_leaves_the_processor_alone() -> None:
-    """Its threads would wait busily for the next run, and take that from a
-    session timed after it.
-    """
+def test_a_session_uses_no_cpu_time_after_its_run() -> None:
+    """Threads that wait busily for the next run would slow a session that is timed after it."""
     session = open_session(shipped_pair()[1], threads=2)
     run(session, IMAGE)
     idle = []

@@ -1,4 +1,4 @@
-"""ONNX files that would harm: each is refused by a sentence before a runtime has it."""
+"""Tests that harmful ONNX files are refused in a sentence before a runtime reads them."""
 
 from collections.abc import Callable
 from copy import deepcopy
@@ -33,7 +33,7 @@ def model(tmp_path: Path) -> onnx.ModelProto:
 
 
 def refusal(model: onnx.ModelProto, to_run: bool = True) -> str:
-    """What is said of a model; no runtime sees it."""
+    """Return the message that refuses a model, and check that no runtime has read it."""
     with patch("onnxruntime.InferenceSession") as session, pytest.raises(ModelError) as caught:
         open_session(parse_onnx(model.SerializeToString(), "untrusted.onnx", to_run), 1)
     assert not session.called
@@ -42,7 +42,7 @@ def refusal(model: onnx.ModelProto, to_run: bool = True) -> str:
 
 
 @pytest.mark.parametrize("encoding", [float_convbeers, integer_convbeers, board_convbeers])
-def test_sound_files_of_every_encoding_run(encoding: Callable[..., Path], tmp_path: Path) -> None:
+def test_valid_files_of_every_encoding_run(encoding: Callable[..., Path], tmp_path: Path) -> None:
     path = encoding(tmp_path / "a.onnx", blocks=1, features=4)
     assert run(open_session(path, 1), IMAGE).shape == IMAGE.shape
 
@@ -51,7 +51,7 @@ def test_sound_files_of_every_encoding_run(encoding: Callable[..., Path], tmp_pa
 @pytest.mark.parametrize(
     "place", ["/etc/passwd", "../secret.bin", "beside.bin", "a/../../b", "link.bin", ""]
 )
-def test_weights_in_other_files_are_never_looked_for(
+def test_weights_in_other_files_are_never_opened(
     place: str, external: bool, model: onnx.ModelProto
 ) -> None:
     tensor = model.graph.initializer[0]
@@ -102,7 +102,7 @@ def typed(kind: int) -> Change:
         (lambda m: m.ClearField("graph"), "an input and an output"),
     ],
 )
-def test_what_a_file_states_but_does_not_hold_is_refused(
+def test_what_a_file_states_and_does_not_contain_is_refused(
     change: Change, words: str, model: onnx.ModelProto
 ) -> None:
     change(model)
@@ -168,7 +168,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("nodes", "words"), REFUSED)
-def test_what_a_runtime_would_do_for_an_untrusted_file_is_refused(
+def test_nodes_that_could_harm_a_runtime_are_refused(
     nodes: str, words: str, model: onnx.ModelProto
 ) -> None:
     model.graph.node.extend(parsed(nodes, "float[1] image => float[1] y").graph.node)
@@ -178,7 +178,7 @@ def test_what_a_runtime_would_do_for_an_untrusted_file_is_refused(
 
 
 def test_computed_weights_run_once_saved_as_the_message_says(tmp_path: Path) -> None:
-    """Weight normalisation, as torch's older exporter writes it."""
+    """The example is a weight normalisation, as torch's older exporter writes it."""
     nodes = "n = ReduceL2<axes=[1,2,3]>(w) d = Div(w, n) y = Conv<pads=[1,1,1,1]>(image, d)"
     weights = {"w": np.ones((4, 4, 3, 3), np.float32)}
     model = parsed(nodes, "float[N,4,H,W] image => float[N,4,P,Q] y", constants=weights)
@@ -233,7 +233,7 @@ def test_a_file_of_absurd_size_is_not_read(tmp_path: Path) -> None:
         load_onnx(path)
 
 
-def test_every_truncation_of_a_file_is_refused_or_sound(model: onnx.ModelProto) -> None:
+def test_every_truncation_of_a_file_is_refused_or_valid(model: onnx.ModelProto) -> None:
     content = model.SerializeToString()
     refused = 0
     for end in range(0, len(content), 37):
@@ -244,7 +244,7 @@ def test_every_truncation_of_a_file_is_refused_or_sound(model: onnx.ModelProto) 
     assert refused >= len(content) // 37 - 5
 
 
-def test_a_network_that_fails_on_an_image_is_one_sentence(tmp_path: Path) -> None:
+def test_a_network_that_fails_on_an_image_raises_one_sentence(tmp_path: Path) -> None:
     sketch = Sketch(1)
     sketch.node("Add", "image", sketch.constant(np.zeros((1, 1, 5, 5), np.float32)))
     other = sketch.save(tmp_path / "a.onnx", "add0")
@@ -257,8 +257,8 @@ def test_a_network_that_fails_on_an_image_is_one_sentence(tmp_path: Path) -> Non
             run(open_session(path, 1), IMAGE)
 
 
-def test_weights_without_sizes_are_one_sentence(tmp_path: Path) -> None:
-    """They are read before the runtime sees the file: for spare channels."""
+def test_weights_without_a_shape_are_refused_in_one_sentence(tmp_path: Path) -> None:
+    """Their shape is needed before the runtime reads the file, to add channels."""
     path = integer_convbeers(tmp_path / "a.onnx", 1, 4)
     model = onnx.load_model(path)
     weight = next(n.input[3] for n in model.graph.node if n.op_type == "QLinearConv")
@@ -268,8 +268,8 @@ def test_weights_without_sizes_are_one_sentence(tmp_path: Path) -> None:
         open_session(parse_onnx(model.SerializeToString(), "flat.onnx"), 1)
 
 
-def test_a_long_chain_of_activations_is_followed_in_a_moment(tmp_path: Path) -> None:
-    """Once it ended in a RecursionError: each was looked past for the QuantizeLinear behind it."""
+def test_a_long_chain_of_activations_is_followed_quickly(tmp_path: Path) -> None:
+    """It once ended in a RecursionError: each Relu searched for a QuantizeLinear behind it."""
     sketch = Sketch(1)
     scale = sketch.constant(np.array(0.5, np.float32))
     zero = sketch.constant(np.array(0, np.int8))
@@ -281,29 +281,29 @@ def test_a_long_chain_of_activations_is_followed_in_a_moment(tmp_path: Path) -> 
     place(read_network(sketch.save(tmp_path / "long.onnx", last), 32), load_dpu("vck190"))
 
 
-def test_there_is_one_door() -> None:
-    """What opens an ONNX file, and what hands one to a runtime, each stand in one place."""
+def test_onnx_files_are_opened_in_few_places() -> None:
+    """Only the modules that are listed here open an ONNX file or pass one to a runtime."""
     root = Path(__file__).parents[2]
-    doors = {
+    openers = {
         "onnx.load": set[str](),
         "ParseFromString(": set[str](),
         "InferenceSession(": set[str](),
     }
     for folder in ("deploy", "model", "profiles", "quant"):
         for path in (root / folder).rglob("*.py"):
-            for word, places in doors.items():
+            for word, places in openers.items():
                 if word in path.read_text(encoding="utf-8"):
                     places.add(str(path.relative_to(root)))
-    assert doors == {
+    assert openers == {
         "onnx.load": set(),
-        # A digest looks only for the names of files beside a network.
+        # A digest only reads the names of files with external weights.
         "ParseFromString(": {
             "quant/onnx/external_weights.py",
             "quant/simplify/simplify.py",
             "quant/onnx_file.py",
         },
-        # The processor is asked with a model of our own making, before any file comes in.
-        # The scripts that run on a board by themselves open what they are told to.
+        # The processor is tested with a model of our own, before any file is read.
+        # The scripts that run alone on a board open the file that they are given.
         "InferenceSession(": {
             "deploy/kit/host.py",
             "deploy/kit/measure.py",

@@ -1,4 +1,4 @@
-"""VINT8 says what the host's file says, to the bit, in the layout of AMD's quantiser."""
+"""Tests that VINT8 computes the bits of the host's file, in the layout of AMD's quantiser."""
 
 from collections import Counter
 from itertools import chain
@@ -71,7 +71,9 @@ NETWORKS = pytest.mark.parametrize("graph", [residual(), unet(), pools()])
 @NETWORKS
 @settings(max_examples=8, deadline=None)
 @given(data=st.data(), tile_px=st.sampled_from([5, 9, 17, 31]), seed=st.integers(0, 99))
-def test_the_host_files_bits(graph: Graph, data: st.DataObject, tile_px: int, seed: int) -> None:
+def test_it_computes_the_bits_of_the_host_file(
+    graph: Graph, data: st.DataObject, tile_px: int, seed: int
+) -> None:
     bits = {name: data.draw(st.integers(2, 7)) for name in ops.tensors(graph)}
     core = build_core(graph, {PLANES: PLANES_FRAC_BITS, **bits})
     image = np.random.default_rng(seed).random((1, 1, tile_px, tile_px), np.float32)
@@ -86,7 +88,7 @@ def test_the_host_files_bits(graph: Graph, data: st.DataObject, tile_px: int, se
 
 
 @NETWORKS
-def test_the_layout_of_amds_quantizer(graph: Graph) -> None:
+def test_it_has_the_layout_of_amds_quantizer(graph: Graph) -> None:
     bits = dict.fromkeys(ops.tensors(graph), 5)
     core = build_core(graph, {PLANES: PLANES_FRAC_BITS, **bits})
     model = vint8_model(core, {}, 9)

@@ -1,6 +1,4 @@
-"""What is trained held to the integer reference: the same whole numbers, whatever the parameters
-have become.
-"""
+"""Helpers that compare a trainable core with the integer reference."""
 
 from typing import Any
 
@@ -29,9 +27,7 @@ from beers_deploy.quant.integer.trainable import TrainableCore
 
 
 def odd_operations(generator: np.random.Generator) -> Graph:
-    """Pads that differ from side to side, groups, dilation, shuffles, poolings, adds and products
-    of other scales.
-    """
+    """Build a graph with uneven pads, groups, dilation, shuffles, pools, and unequal scales."""
 
     def conv(
         name: str, source: str, shape: tuple[int, ...], window: Window, groups: int = 1, **more: Any
@@ -78,7 +74,7 @@ def odd_operations(generator: np.random.Generator) -> Graph:
 
 
 def moved(core: IntCore) -> TrainableCore:
-    """A core whose weights and biases training has moved by a unit or so."""
+    """Return a core whose weights and biases are off by a unit or so, as after training."""
     generator = torch.Generator().manual_seed(3)
     trainable = TrainableCore(core)
     with torch.no_grad():
@@ -87,9 +83,10 @@ def moved(core: IntCore) -> TrainableCore:
     return trainable
 
 
-def hold_to_reference(trainable: TrainableCore, planes: np.ndarray) -> None:
-    """Fail where a tensor differs; a correction in copies may by half a unit where a fine copy
-    holds it.
+def assert_equals_reference(trainable: TrainableCore, planes: np.ndarray) -> None:
+    """Check that all tensors equal those of the integer reference.
+
+    A correction in copies may differ by half a unit where a fine copy holds it.
     """
     core = trainable.core()
     expected, _ = run_core(core, planes)

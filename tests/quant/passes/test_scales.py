@@ -13,7 +13,7 @@ from beers_deploy.quant.graph import CORRECTION, PLANES, Add, Conv, Graph, ties_
 from beers_deploy.quant.integer.trainable import TrainableCore
 from beers_deploy.quant.passes.scales import moved, with_better_scales
 from tests.quant.quick import with_relu6
-from tests.quant.trained import hold_to_reference, odd_operations
+from tests.quant.trained import assert_equals_reference, odd_operations
 
 PLANES_OF_NOISE = np.random.default_rng(0).integers(-128, 128, (1, 3, 12, 10)).astype(np.int8)
 
@@ -116,7 +116,7 @@ def test_every_core_tried_is_legal_and_trained_as_the_reference_runs_it(
         assert exact_adds(each) >= exact_adds(core)
         assert each.frac_bits[PLANES] == 7
         assert each.frac_bits["b"] == core.frac_bits["b"]
-    hold_to_reference(TrainableCore(cores[-1]), PLANES_OF_NOISE)
+    assert_equals_reference(TrainableCore(cores[-1]), PLANES_OF_NOISE)
 
 
 def test_tensors_that_share_a_scale_move_jointly() -> None:

@@ -245,7 +245,7 @@ def spans(size_px: int, kept_px: int, halo_px: int) -> list[tuple[int, int, int,
 def check_tiles(
     model: onnx.ModelProto, image: np.ndarray, all_cells: tuple[int, ...], short_px: int = 0
 ) -> None:
-    """Check that tiles give the result of the int64_tensor image (1, C, H, W), bit for bit.
+    """Check that tiles give the result of the whole image (1, C, H, W), bit for bit.
 
     Each number in `all_cells` is the side of a tile in steps of the alignment. The halo is shorter
     by `short_px`.
