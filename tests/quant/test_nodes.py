@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from onnx import helper
 from onnx.reference import ReferenceEvaluator
@@ -44,11 +44,10 @@ def with_offset_windows(draw: st.DrawFn) -> Row:
 def test_sizes_are_the_runtimes_own(row: Row, side: int) -> None:
     model = row.model()
     shape = network_of(model, side).operations[0].out_shape
-    if shape is not None:
-        assert (
-            result_of(open_session(model), np.zeros((1, 1, side, side), np.float32)).shape[1:]
-            == shape
-        )
+    # A window that is larger than its map has no size.
+    assume(shape is not None)
+    result = result_of(open_session(model), np.zeros((1, 1, side, side), np.float32))
+    assert result.shape[1:] == shape
 
 
 RESHAPED = [[0, 6, -1], [-1, 3, 0, 10], [1, 3, 2, 20]]

@@ -84,7 +84,7 @@ def test_no_file_outside_the_models_folder_is_opened(
     (saved.parents[1] / "weights.bin").write_bytes((saved.parent / "weights.bin").read_bytes())
     rewritten(saved, stating("location", place))
     model = onnx.load_model(saved, load_external_data=False)
-    # Only the tensor with the changed place stays, so that no other tensor opens a file.
+    # The tensor with the changed place comes first now, so that no other one opens a file earlier.
     model.graph.initializer.pop(0)
     monkeypatch.setattr(Path, "open", lambda *_: pytest.fail("opened"))
     with pytest.raises(ModelError, match="outside the model's folder"):

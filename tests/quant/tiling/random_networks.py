@@ -59,15 +59,15 @@ class Builder(Row):
         """
         mode = self.draw(st.sampled_from(["constant", "edge", "reflect"]))
         before, behind = self.pads(2)[::2]
-        self.add("Pad", int64_tensor("pads", 0, 0, before, before, 0, 0, behind, behind), mode=mode)
+        self.add("Pad", int64_tensor(0, 0, before, before, 0, 0, behind, behind), mode=mode)
         if before == behind or self.draw(st.booleans()):
             self.convolve(3)
         else:
             self.add(
                 "Slice",
-                int64_tensor("from", behind, behind),
-                int64_tensor("to", *[-before or 1 << 62] * 2),
-                int64_tensor("axes", 2, 3),
+                int64_tensor(behind, behind),
+                int64_tensor(*[-before or 1 << 62] * 2),
+                int64_tensor(2, 3),
             )
 
     def transposed(self) -> None:

@@ -42,8 +42,8 @@ def network(
     return model
 
 
-def int64_tensor(name: str, *values: int) -> onnx.TensorProto:
-    return numpy_helper.from_array(np.array(values, np.int64), name)
+def int64_tensor(*values: int) -> onnx.TensorProto:
+    return numpy_helper.from_array(np.array(values, np.int64))
 
 
 def taps(name: str, *shape: int) -> onnx.TensorProto:
@@ -54,9 +54,7 @@ def taps(name: str, *shape: int) -> onnx.TensorProto:
 
 def float32_tensor(*values: float) -> onnx.TensorProto:
     """Return a float32 tensor of the values, or a scalar if there is one."""
-    return numpy_helper.from_array(
-        np.array(values if len(values) > 1 else values[0], np.float32), "real"
-    )
+    return numpy_helper.from_array(np.array(values if len(values) > 1 else values[0], np.float32))
 
 
 def graph(

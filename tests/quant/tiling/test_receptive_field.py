@@ -51,7 +51,7 @@ CONSTANTS = {
 def model_of(nodes: str, bands: tuple[int, int] = (1, 1)) -> onnx.ModelProto:
     """Return a network from `image` to `restored`."""
     ends = f"float[N,{bands[0]},H,W] image => float[N,{bands[1]},P,Q] restored"
-    return parsed(f"{nodes}", ends, constants=CONSTANTS)
+    return parsed(nodes, ends, constants=CONSTANTS)
 
 
 HALF_PIXEL = 'coordinate_transformation_mode="half_pixel"'
