@@ -495,7 +495,7 @@ def test_finetuning_learns_from_the_original() -> None:
     errors = []
     for original in (None, model):
         tuning = Tuning(BARE.pairs, 40, rate=0.3, original=original)
-        # One image a step, so that the steps are quick.
+        # One image a step keeps the steps quick.
         with patch("beers_deploy.quant.passes.finetune.BATCH_PIXELS", 1):
             core, _ = finetune(int8.core, graph, tuning)
         errors.append(squared_error(host_model(core, {}), model))

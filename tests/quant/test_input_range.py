@@ -1,6 +1,4 @@
-"""Networks of other ranges than [0, 1]: their integers, their borders, and which ranges are
-refused.
-"""
+"""Tests of networks with other ranges than [0, 1]: integers, borders and refused ranges."""
 
 from collections.abc import Sequence
 from itertools import chain

@@ -255,7 +255,7 @@ def test_files_of_other_quantizers_give_the_same_numbers(
     float_onnx: onnx.ModelProto,
     tmp_path: Path,
 ) -> None:
-    """Activations are asymmetric, scales are float, and the runtime fuses QDQ to integers."""
+    """Activations are asymmetric, scales float; the runtime fuses QDQ into integer operators."""
     options = {
         "quant_format": form,
         "per_channel": per_channel,

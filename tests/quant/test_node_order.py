@@ -15,7 +15,7 @@ from tests.quant.quick import copied, image
 
 
 def network() -> onnx.ModelProto:
-    """Write a chain with a branch, of eight nodes."""
+    """Build a chain of eight nodes that read the image again."""
     w = GraphWriter()
     last = "image"
     for number in range(4):

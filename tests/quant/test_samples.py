@@ -58,7 +58,7 @@ def test_a_folder_holds_images_and_arrays(
 ) -> None:
     """A folder may hold image files and arrays; other files in it are ignored.
 
-    Pixels of image files are divided by full scale, arrays are read as they are.
+    Pixels of image files are divided by full scale. Arrays are read as they are.
     """
     numbers = np.arange(40 * 30).reshape(40, 30)
     pixels = (numbers % full_scale).astype(kind)

@@ -98,8 +98,7 @@ def exact_adds(core: IntCore) -> set[str]:
 def test_every_core_tried_is_legal_and_trained_as_the_reference_runs_it(
     seed: int, same: bool
 ) -> None:
-    """Each core that is tried fits the shifts of the DPU, and keeps the planes and what a ReLU6
-    clips.
+    """Each core that is tried fits the DPU's shifts, and keeps the planes' and the ReLU6's scales.
 
     Adds that were exact stay so, and training computes the last core as the reference does.
     """

@@ -61,7 +61,7 @@ def values() -> dict[str, np.ndarray]:
 
 
 def single(value: ArrayLike) -> np.ndarray:
-    """Return an array of float32, or of int64."""
+    """Return the value as an array, float32 if it is of any float type."""
     array = np.asarray(value)
     return array.astype(np.float32) if array.dtype.kind == "f" else array
 

@@ -1,4 +1,4 @@
-"""Large kernels and crops become windows that every target computes, and stay what they were."""
+"""Tests that large kernels and crops become windows that every target computes."""
 
 from typing import Any
 
@@ -75,7 +75,7 @@ def test_a_large_kernel_is_several_small_ones_and_their_sum(
     bias = drawn(generator, outputs)
     window = f"pads={pads}, strides={list(strides)}, dilations={list(dilations)}, group={groups}"
     model = network_from(f"y = Conv<{window}>(x, w, b)", ends=ENDS, w=weight, b=bias)
-    # The pass alone, because `simplify` extends a network without padding by a border.
+    # The pass runs alone, because `simplify` adds a border to a network without padding.
     short = copied(model)
     graph = OnnxGraph(short)
     graph.rewrite(split_large_kernel)

@@ -24,7 +24,7 @@ from tests.quant.simplify.networks import parsed
 
 
 def weights(**shapes: tuple[int, ...]) -> dict[str, ArrayLike]:
-    """Return random weights, such that values keep their size from layer to layer."""
+    """Return random weights with which values keep their size from layer to layer."""
     return {
         name: np.random.default_rng(list(name.encode())).normal(size=shape)
         / math.sqrt(math.prod(shape[1:]))
