@@ -53,9 +53,9 @@ def exported_seeds(_: Path) -> list[bytes]:
     """Return networks like those of exporters: computed constants, normalisation, padding, other
     opsets, 16-bit floats.
     """
-    sizes = CASES["sizes of constants"][0]
+    sizes = CASES["sizes computed from constants"][0]
     scaled = CASES["normalised and scaled again"][0]
-    idle = CASES["what does nothing"][0]
+    idle = CASES["operators without an effect"][0]
     networks = [
         network_from(sizes),
         network_from(scaled, 9),

@@ -65,7 +65,7 @@ def sketch(
 
 
 VALID = {
-    "features beside the image": sketch(
+    "features next to the image": sketch(
         f"""large = {SAME}(in, large_w, large_b)
         r = Relu(large)
         both = Concat<axis=1>(in, r)
@@ -94,7 +94,7 @@ VALID = {
         inner=(4, 4, 3, 3),
         last=(1, 4, 3, 3),
     ),
-    "leaking upwards": sketch(
+    "leaky ReLU behind a transposed convolution": sketch(
         """down = Conv<strides=[2,2]>(in, down_w, down_b)
         up = ConvTranspose<strides=[2,2], pads=[1,1,1,1]>(down, up_w, up_b)
         leaky = LeakyRelu<alpha=0.1015625>(up)
@@ -130,7 +130,7 @@ VALID = {
         rows=(4, 1, 1, 3),
         columns=(1, 4, 3, 1),
     ),
-    "names of ours": sketch(
+    "names that the quantiser uses": sketch(
         f"""[planes] planes = {SAME}(in, first_w, first_b)
         [image] image = Relu(planes)
         [restored] restored = {SAME}(image, inner_w, inner_b)
@@ -142,7 +142,7 @@ VALID = {
         inner=(4, 4, 3, 3),
         last=(1, 4, 1, 1),
     ),
-    "thirds": sketch(
+    "strides of three": sketch(
         """down = Conv<strides=[3,3]>(in, down_w, down_b)
         up = ConvTranspose<strides=[3,3]>(down, up_w, up_b)
         out = Add(in, up)""",

@@ -47,7 +47,7 @@ def test_valid_files_of_every_encoding_run(encoding: Callable[..., Path], tmp_pa
     assert run(open_session(path, 1), IMAGE).shape == IMAGE.shape
 
 
-@pytest.mark.parametrize("external", [True, False], ids=["apart", "beside the weights themselves"])
+@pytest.mark.parametrize("external", [True, False], ids=["external", "next to stored weights"])
 @pytest.mark.parametrize(
     "place", ["/etc/passwd", "../secret.bin", "beside.bin", "a/../../b", "link.bin", ""]
 )

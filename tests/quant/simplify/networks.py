@@ -145,7 +145,7 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         f"c = {SAME}(x, one) m = Mul(c, image) y = {SAME}(m, w)",
         {"Conv": 3},
     ),
-    "the larger, the smaller and the size": (
+    "maximum, minimum and absolute value": (
         f"{CONV} m = Max(x, c) n = Min(m, c) y = Abs(n)",
         {"Conv": 2, "Add": 5, "Mul": 3, "Relu": 4},
     ),
@@ -163,7 +163,7 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         f"{CONV} n = Neg(x) m = Neg(c) a = Add(n, m) y = Mul(a, x)",
         {"Conv": 2, "Add": 1, "Mul": 1},
     ),
-    "ReLU of the image as it is scaled": (
+    "ReLU of the scaled image": (
         f"m = Mul(x, six) n = Sub(m, half) r = Relu(n) y = {SAME}(r, w)",
         {"Conv": 2, "Relu": 1},
     ),
@@ -184,24 +184,27 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         output_padding=[1,2]>(x, up)""",
         {"ConvTranspose": 1},
     ),
-    "a residual taken away": (f"{CONV} y = Sub(x, c)", {"Conv": 1, "Add": 1}),
-    "a convolution less the image": (f"{CONV} y = Sub(c, x)", {"Conv": 1, "Mul": 1, "Add": 1}),
+    "a residual subtracted": (f"{CONV} y = Sub(x, c)", {"Conv": 1, "Add": 1}),
+    "the image subtracted from a convolution": (
+        f"{CONV} y = Sub(c, x)",
+        {"Conv": 1, "Mul": 1, "Add": 1},
+    ),
     "normalised, and read elsewhere": (f"{CONV} n {NORMAL} y = Add(c, n)", {"Conv": 2, "Add": 1}),
-    "added to the image as it is normalised": (
+    "added to the normalised image": (
         f"""m = Mul(x, image) n = Sub(m, half) c = {SAME}(n, w) a = Add(n, c)
         p = Add(a, half) y = Div(p, image)""",
         {"Mul": 1, "Sub": 1, "Conv": 1, "Add": 1},
     ),
-    "taken from the image as it is normalised": (
+    "subtracted from the normalised image": (
         f"""m = Mul(x, six) n = Sub(m, half) c = {SAME}(n, w) a = Sub(n, c)
         p = Add(a, half) y = Div(p, six)""",
         {"Mul": 1, "Sub": 1, "Conv": 1, "Add": 1},
     ),
-    "clipped, and turned around": (
+    "clipped, and subtracted from 3": (
         f"{CONV} a = Add(c, x) k = Clip(a, zero, half) y = Sub(three, k)",
         {"Mul": 1, "Conv": 1, "Add": 2, "Clip": 1},
     ),
-    "added to the image as it is normalised, and left so": (
+    "added to the normalised image, without scaling back": (
         f"m = Mul(x, six) n = Sub(m, half) c = {SAME}(n, w) a = Add(n, c) y = Add(a, half)",
         {"Mul": 1, "Sub": 1, "Conv": 1, "Add": 2},
     ),
@@ -213,11 +216,11 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         f"c = {SAME}(x, one) d = {SAME}(x, w) y = Mul(c, d)",
         {"Conv": 3, "Mul": 1},
     ),
-    "one channel less four": (
+    "four channels subtracted from one": (
         f"c = {SAME}(x, one) r = Relu(x) d = Sub(c, r) y = Mul(d, r)",
         {"Conv": 2, "Relu": 1, "Add": 1, "Mul": 2},
     ),
-    "one channel and four, and no more": (
+    "one channel plus four": (
         f"c = {SAME}(x, one) d = {SAME}(x, w) y = Add(c, d)",
         {"Conv": 3, "Add": 1},
     ),
@@ -230,21 +233,21 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         f"c = {SAME}(x, one) t = Tile(c, four_channels) y = Mul(t, x)",
         {"Conv": 2, "Mul": 1},
     ),
-    "zeros around": ("p = Pad(x, pads) y = Conv(p, w)", {"Conv": 1}),
-    "zeros around, lopsided": ("p = Pad(x, around) y = Conv(p, w)", {"Conv": 1}),
-    "a mirror around": ('p = Pad<mode="reflect">(x, pads) y = Conv(p, w)', {"Pad": 1, "Conv": 1}),
+    "zero padding": ("p = Pad(x, pads) y = Conv(p, w)", {"Conv": 1}),
+    "uneven zero padding": ("p = Pad(x, around) y = Conv(p, w)", {"Conv": 1}),
+    "mirrored padding": ('p = Pad<mode="reflect">(x, pads) y = Conv(p, w)', {"Pad": 1, "Conv": 1}),
     "ReLU6": (f"{CONV} y = Clip(c, zero, six)", {"Conv": 1, "Clip": 1}),
     "HardSwish": (
         "h = HardSigmoid<alpha=0.16666667, beta=0.5>(x) y = Mul(h, x)",
         {"HardSwish": 1},
     ),
     "ReLU, clipped on one side": (f"{CONV} y = Clip(c, zero)", {"Conv": 1, "Relu": 1}),
-    "ReLU as the larger of two": (f"{CONV} y = Max(zero, c)", {"Conv": 1, "Relu": 1}),
+    "ReLU as a maximum": (f"{CONV} y = Max(zero, c)", {"Conv": 1, "Relu": 1}),
     "HardSwish spelled out": (
         f"{CONV} a = Add(c, three) k = Clip(a, zero, six) h = Div(k, six) y = Mul(c, h)",
         {"Conv": 1, "HardSwish": 1},
     ),
-    "HardSwish, its sixth at the end": (
+    "HardSwish that divides last": (
         f"{CONV} a = Add(three, c) k = Clip(a, zero, six) p = Mul(k, c) y = Mul(p, sixth)",
         {"Conv": 1, "HardSwish": 1},
     ),
@@ -278,11 +281,11 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
     ),
     "a mean over channels": ("y = ReduceMean<axes=[1]>(x)", {"Conv": 1}),
     "three summed": (f"{CONV} d = {SAME}(c, w) y = Sum(x, c, d)", {"Conv": 2, "Add": 2}),
-    "what does nothing": (
+    "operators without an effect": (
         f"i = Identity(x) c = {SAME}(i, w) d = Dropout(c) y = Cast<to=1>(d)",
         {"Conv": 1},
     ),
-    "sizes of constants": (
+    "sizes computed from constants": (
         """z = ConstantOfShape<value = int64[1] {0}>(two)
         e = Slice(around, two, four)
         sizes = Concat<axis=0>(z, e, z, e)
@@ -304,7 +307,7 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         "s = Resize(x, , , small) f = Reshape(s, rows) g = Gemm(f, wide) y = Unsqueeze(g, axes)",
         {"Resize": 1, "Conv": 1, "Flatten": 1, "Unsqueeze": 1},
     ),
-    "shares of classes": (
+    "probabilities of classes": (
         """l = Mul(x, six)
         m = MaxPool<kernel_shape=[9,11]>(l)
         p = GlobalAveragePool(m)
