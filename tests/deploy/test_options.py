@@ -193,7 +193,7 @@ WRONG_TYPES = [5, 2.5, {"a": 1}, [5], [None], ((1, 2),), np.zeros((2, 2)), objec
 """Values that are neither a text nor a path, nor a list of them."""
 
 
-@pytest.mark.parametrize("value", WRONG_TYPES, ids=repr)
+@pytest.mark.parametrize("value", WRONG_TYPES, ids=lambda value: type(value).__name__)
 @pytest.mark.parametrize("name", sorted(COMMANDS))
 def test_a_text_or_path_of_another_type_is_refused(name: str, value: object) -> None:
     names = ("lpips", "recipe", "scene", "with_", "edge", "cases", "need", "scheduler", "out")
