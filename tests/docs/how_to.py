@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from tests.deploy.test_outputs import written
+from tests.deploy.test_outputs import outputs_of
 from tests.docs.test_commands_in_pages import NAME, context_of
 from tests.docs.walk import ROOT
 
@@ -124,4 +124,4 @@ def outputs(command: str) -> list[Path]:
         return [Path(name) for name in re.findall(r"--out (\S+)", command)]
     name = shlex.split(command)[1]
     values = context_of(command).params
-    return [Path(values[key]) / inside for key, inside in written(name).items() if values[key]]
+    return [Path(values[key]) / inside for key, inside in outputs_of(name).items() if values[key]]
