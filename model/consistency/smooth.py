@@ -75,7 +75,7 @@ class Smoothing:
         return cls(variances, sensor.offset_dn * full_scale / sensor.max_dn)
 
     def smoothed(self, restored: Image) -> Image:
-        """Return smoothed pixels, (h, w) float32.
+        """Return smoothed pixels, (h, w) float32; `restored` itself if it has no dark pixel.
 
         Every pixel is computed by the same float32 operations in the same order wherever the array
         begins in the image. Pixels within SMOOTH_PX of a missing one are returned unchanged.

@@ -228,11 +228,13 @@ class Consistency:
             fine = self.detail.correction(raw_pixels, near_pixels, down, across)
             # Next to a block that does not count the finer residual is no noise, and may be NaN.
             change += fine if share is None else np.where(share == 1, fine, np.float32(0))
-        inner = tuple(
-            slice(side.keep_start - side.start, side.keep_stop - side.start)
-            for side in (down, across)
-        )
-        return change + np.where(missing, np.float32(0), smooth - restored)[inner]
+        if smooth is not restored:
+            rows, columns = (
+                slice(side.keep_start - side.start, side.keep_stop - side.start)
+                for side in (down, across)
+            )
+            change += np.where(missing, np.float32(0), smooth - restored)[rows, columns]
+        return change
 
     def _far(
         self, finite: Image, missing: NDArray[np.bool_] | None, down: Placed, across: Placed
