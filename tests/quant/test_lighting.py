@@ -70,6 +70,7 @@ def test_ground_without_light_stays_finite(name: str) -> None:
     assert np.isfinite(light_factor(name, np.zeros((9, 11)), 400.0, np.random.default_rng(0)))
 
 
+@pytest.mark.slow
 def test_default_patches_cover_the_range_and_those_of_the_gate_as_well() -> None:
     """Without relighting, 99.9 % of a scene's pixels lie in the lower half of the range."""
     calibration = Calibration(SENSOR, None, patches=32, patch_px=48, seed=0)

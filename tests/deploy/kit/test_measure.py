@@ -41,6 +41,7 @@ def test_runs_are_added_to_the_list(
     assert min(first["fps"], second["fps"]) > 0
 
 
+@pytest.mark.slow
 def test_the_core_of_a_kit_is_measured_at_its_own_size(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

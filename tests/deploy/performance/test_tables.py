@@ -140,6 +140,7 @@ def test_bad_sizes_and_tiles_are_refused(
             parse(text)
 
 
+@pytest.mark.slow
 def test_bench_on_this_machine(tmp_path: Path) -> None:
     model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
     out = tmp_path / "host.json"

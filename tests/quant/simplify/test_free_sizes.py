@@ -212,6 +212,7 @@ class Selected(nn.Module):
         return result
 
 
+@pytest.mark.slow
 def test_torchs_newer_exporter_selects_channels_in_another_way(tmp_path: Path) -> None:
     """It writes GatherND between two Transposes, and a mean that onnx converts incompletely."""
     image = torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(0))
