@@ -362,7 +362,10 @@ def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
 
 def main(source: str, target: str, runs: dict[float, Any], learn: bool) -> None:
     """Restore the image in `source` into `target`, tile by tile; `runs` has each factor's core."""
-    image = np.load(source).astype(F)
+    try:
+        image = np.load(source).astype(F)
+    except (EOFError, OSError, ValueError) as error:
+        sys.exit(f"{source} cannot be read as an array of numbers: {error}")
     t = S["tile_px"]
     r = S["scale"]
     whole = image.ndim == 3 and len(image) == S["channels"] and min(image.shape[1:]) >= t

@@ -101,7 +101,7 @@ PRODUCTS_PER_PX = (
     + 2 * (1 + 1 / BLOCK_PX)  # Interpolation.
 )
 """The number of multiply-accumulate operations of the step per pixel, without smoothing the dark:
-about 20 more where an image is dark.
+about 30 more where an image is dark.
 """
 
 DETAIL_PRODUCTS_PER_PX = products_per_px(RANK, NEAR_PX)

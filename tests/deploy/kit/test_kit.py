@@ -153,13 +153,23 @@ def test_the_host_part_refuses_what_it_cannot_restore(
     assert not (tmp_path / "out.npy").exists()
 
 
-def test_digital_numbers_in_the_place_of_shares_are_refused(kit: Path, tmp_path: Path) -> None:
-    """Otherwise all digital numbers would be restored to white."""
-    np.save(tmp_path / "image.npy", np.full((1, 96, 96), 900, np.uint16))
+@pytest.mark.parametrize(
+    ("image", "words"),
+    [
+        # Otherwise all digital numbers would be restored to white.
+        (np.full((1, 96, 96), 900, np.uint16), "mostly above full scale. Divide its values"),
+        (np.full((1, 96, 96), "a"), "cannot be read as an array of numbers"),
+    ],
+    ids=["digital numbers", "texts"],
+)
+def test_values_that_are_no_shares_are_refused(
+    image: np.ndarray, words: str, kit: Path, tmp_path: Path
+) -> None:
+    np.save(tmp_path / "image.npy", image)
     command = [sys.executable, "host.py", str(tmp_path / "image.npy"), str(tmp_path / "out.npy")]
     result = subprocess.run(command, cwd=kit, check=False, capture_output=True, text=True)
     assert result.returncode == 1
-    assert result.stderr.endswith("mostly above full scale. Divide its values by full scale.\n")
+    assert words in result.stderr.splitlines()[-1]
     assert not (tmp_path / "out.npy").exists()
 
 
