@@ -26,10 +26,9 @@ from numpy.typing import NDArray
 
 from beers_deploy.model.family import noise_over_full_scale
 from beers_deploy.model.levels import LEVELS, Level
-from beers_deploy.model.pixel_noise import noise_variances
 from beers_deploy.model.simulator.mtf import mtf, sensor_mtf
 from beers_deploy.profiles.errors import ModelError, OptionError, printable, reason_of
-from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.instrument import Instrument, noise_variances
 from beers_deploy.profiles.response import NYQUIST
 from beers_deploy.profiles.toml import parse_json
 
@@ -233,7 +232,7 @@ class HalfWidth:
     """The half-width of pixels of one sensor at one level.
 
     Attributes:
-        variances: the variances of the noise, see `model.pixel_noise.noise_variances`.
+        variances: the variances of the noise, see `profiles.instrument.noise_variances`.
         offset: the pixel value of the dark.
         conditions: those that the sensor sets.
         exponents: how the half-width grows with them, with noise and with detail.

@@ -30,9 +30,8 @@ from beers_deploy.model.interval import (
     noise_and_detail,
 )
 from beers_deploy.model.levels import LEVELS
-from beers_deploy.model.pixel_noise import noise_variances
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.instrument import Instrument, noise_variances
 
 LEAST_ERROR = 0.02
 """The least |error| / sigma in the fit, where the logarithm of 0 would not be finite."""

@@ -39,8 +39,7 @@ from scipy.ndimage import distance_transform_edt, maximum_filter
 
 from beers_deploy.model.consistency.blocks import Image, Placed
 from beers_deploy.model.consistency.step import blur_between, centre
-from beers_deploy.model.pixel_noise import noise_variances
-from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.instrument import Instrument, noise_variances
 
 Array = NDArray[np.float64]
 

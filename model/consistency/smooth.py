@@ -24,8 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beers_deploy.model.consistency.blocks import Image, weighted_sums
-from beers_deploy.model.pixel_noise import noise_variances
-from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.instrument import Instrument, noise_variances
 
 WINDOW_PX = 3
 """Side of a window. One of 5 pixels gains as much and takes longer (measured)."""

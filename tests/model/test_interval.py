@@ -9,8 +9,8 @@ import pytest
 
 from beers_deploy.model.family import noise_over_full_scale
 from beers_deploy.model.interval import LEAST_DETAIL, MIDDLE_NOISE, PixelInterval
-from beers_deploy.model.pixel_noise import noise_variances
 from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.instrument import noise_variances
 from tests.model.exponents import EXPONENTS
 from tests.model.simulator.stages import NOMINAL
 

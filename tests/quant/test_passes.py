@@ -290,6 +290,13 @@ def one_scale() -> AbstractContextManager[object]:
     return patch.object(CropTrials, "error", return_value=0.0)
 
 
+def error_of(quantized: Quantized, model: onnx.ModelProto) -> float:
+    """Return the mean error of an INT8 network against the float one, on one image."""
+    shown = image(40, 40)
+    expected = result_of(open_session(model), shown)
+    return float(np.abs(result_of(open_session(quantized.host), shown) - expected).mean())
+
+
 def test_sums_that_grow_by_far_have_scales_of_their_own(patches: Patches) -> None:
     model = sketch(
         f"""first = {SAME}(in, first_w, first_b) inner = {SAME}(first, inner_w, inner_b)
@@ -304,13 +311,7 @@ def test_sums_that_grow_by_far_have_scales_of_their_own(patches: Patches) -> Non
     with one_scale():
         shared = quickly(model, patches)
     apart = quickly(model, patches)
-    shown = image(40, 40)
-    expected = result_of(open_session(model), shown)
-    errors = [
-        np.abs(result_of(open_session(each.host), shown) - expected).mean()
-        for each in (apart, shared)
-    ]
-    assert errors[0] < errors[1] / 2
+    assert error_of(apart, model) < error_of(shared, model) / 2
 
 
 def test_a_small_tensor_of_a_group_has_a_finer_scale(patches: Patches) -> None:
@@ -331,10 +332,4 @@ def test_a_small_tensor_of_a_group_has_a_finer_scale(patches: Patches) -> None:
     with one_scale(), patch("beers_deploy.quant.plan.finer_members", return_value={}):
         plain = quickly(model, patches)
     assert finer.core.frac_bits["head"] > plain.core.frac_bits["head"]
-    shown = image(40, 40)
-    expected = result_of(open_session(model), shown)
-    errors = [
-        np.abs(result_of(open_session(each.host), shown) - expected).mean()
-        for each in (finer, plain)
-    ]
-    assert errors[0] < errors[1] / 2
+    assert error_of(finer, model) < error_of(plain, model) / 2

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from beers_deploy.model.consistency.smooth import LIGHT, SMOOTH_PX, Smoothing
-from beers_deploy.model.pixel_noise import noise_variances
 from beers_deploy.profiles.effects import Offset
+from beers_deploy.profiles.instrument import noise_variances
 from tests.model.consistency.images import FULL_SCALE
 from tests.model.simulator.stages import NOMINAL, plain_sensor
 
