@@ -104,15 +104,42 @@ DECODINGS: dict[str, Any] = {
 """Functions that decode the copies of each channel that a core writes, by the name in host.json."""
 
 
+ACTIVATIONS: dict[str, Any] = {
+    "Sigmoid": lambda values: 0.5 + 0.5 * np.tanh(0.5 * values),
+    "Tanh": np.tanh,
+}
+"""Functions of a decoded result, by the name in host.json."""
+
+
+def enlarged(image: np.ndarray) -> np.ndarray:
+    """Enlarge a tile (1, C, h, w) by a factor, from which each row of the weights has a pixel."""
+    weights = np.array(S["enlargement"], F)
+    factor, taps = weights.shape
+    if factor == 1:
+        return image
+    # First down, then across.
+    for _ in range(2):
+        _, channels, height, width = image.shape
+        wide = np.pad(image, [(0, 0), (0, 0), (taps // 2, taps // 2), (0, 0)], "edge")
+        shifts = [wide[:, :, k : k + height] for k in range(taps)]
+        phases = [sum(w * shift for w, shift in zip(phase, shifts)) for phase in weights]  # noqa: B905 - as above
+        tall = np.stack(phases, 3).reshape(1, channels, factor * height, width)
+        image = tall.swapaxes(2, 3)
+    return image
+
+
 def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
     """Restore a tile (1, C, h, w) by one core: encode it, decode the result, and add the tile.
 
     `run` computes the core's result from planes. A result of 1 is `unit` of full scale.
     """
     copies = np.split(run(encoded(image)), S["copies"], 1)
-    value = shuffled(DECODINGS[S["decoding"]](*copies), S["back"], up=True) * F(unit)
+    value = DECODINGS[S["decoding"]](*copies)
+    if S["activation"]:
+        value = ACTIVATIONS[S["activation"]](value.astype(np.float64)).astype(F)
+    value = shuffled(value, S["back"], up=True) * F(unit)
     if S["adds_image"]:
-        value = image + value
+        value = enlarged(image) + value
     if S["limits"]:
         value = np.clip(value, *S["limits"])
     return shuffled(value, S["last"], up=True)

@@ -29,6 +29,7 @@ import numpy as np
 import onnx
 
 from beers_deploy.quant.graph.attention import aligned, shrinking
+from beers_deploy.quant.graph.host_end import host_end
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.activations_first import activations_first
@@ -170,9 +171,10 @@ def nodes_by_kind(graph: OnnxGraph) -> dict[Kind, list[Node]]:
     order.
     """
     nodes: dict[Kind, list[Node]] = {}
+    on_host = host_end(graph).replaced
     for node in graph.nodes:
         kind = kind_of(graph, node)
-        if kind is not None:
+        if kind is not None and node.outputs[0] not in on_host:
             nodes.setdefault(kind, []).append(node)
     return nodes
 

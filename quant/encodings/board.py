@@ -71,10 +71,11 @@ def _core_file(
     read_px = tile_px and (tile_px + 2 * host_part.border_px) // host_part.place_px
     size = image_info(PLANES, host_part.planes, read_px)
     written = host_part.decoding.copies * host_part.outputs
-    written_px = tile_px and tile_px // host_part.correction_px
+    factor = host_part.enlargement.factor
+    written_px = tile_px and tile_px * factor // host_part.correction_px
     result = image_info(CORRECTION, written, written_px)
-    # A result that the image is not added to may have another size than the image.
-    if not host_part.adds_image:
+    # A result that the image itself is not added to may have another size.
+    if factor > 1 or not host_part.adds_image:
         sides = result.type.tensor_type.shape.dim[2:]
         for side, name in zip(sides, ("rows", "columns"), strict=True):
             side.dim_param = name

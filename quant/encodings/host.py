@@ -135,7 +135,7 @@ def live_tensors(core: IntCore, at: int) -> list[str]:
 
 def _result(core: IntCore, tile_px: int | None) -> onnx.ValueInfoProto:
     host_part = core.host_part
-    if host_part.adds_image and not host_part.last:
+    if host_part.adds_image and not host_part.last and host_part.enlargement.factor == 1:
         return image_info("restored", host_part.image_channels, tile_px)
     shuffles = (*host_part.back, *host_part.last)
     squares = math.prod(shuffle.block**2 for shuffle in shuffles)

@@ -11,11 +11,11 @@ import onnx
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph.attention import aligned, shrinking
+from beers_deploy.quant.graph.host_end import host_end
 from beers_deploy.quant.graph.node_operations import ACTIVATIONS, READERS, read_activation, require
 from beers_deploy.quant.graph.operations import (
     CORRECTION,
     IMAGE,
-    SIX,
     Activation,
     Add,
     AveragePool,
@@ -40,7 +40,6 @@ from beers_deploy.quant.graph.split_network import (
     sized,
     unsupported,
 )
-from beers_deploy.quant.input_range import is_range
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.runnable import check_runnable
 from beers_deploy.quant.simplify.fold_affine import affine_of
@@ -92,8 +91,15 @@ def read_network(model: onnx.ModelProto) -> SplitNetwork:
     """
     with contradictions("the float network"):
         reader = _Reader(model)
-        network = cut(reader.graph(), reader.channels())
-        network = replace(network, border_px=reader.border_px, limits=reader.limits)
+        network = cut(reader.graph(), reader.channels(), not reader.end.adds_in_core)
+        network = replace(
+            network,
+            border_px=reader.border_px,
+            limits=reader.end.limits,
+            activation=reader.end.activation,
+            enlargement=reader.end.enlargement or network.enlargement,
+            adds_image=network.adds_image or reader.end.enlargement is not None,
+        )
         check_network(network)
     # Last, because what else is refused would be after adapting as well.
     if reader.adaptable is not None:
@@ -121,8 +127,8 @@ class _Reader:
         self.image, *_ = self.source.inputs
         self.ops: list[Op] = []
         self._places: dict[str, int] = {}  # where the operation that writes a tensor stands
-        self.limits: tuple[float, ...] = ()
         self.border_px = self._take_mirror()
+        self.end = host_end(self.source)
 
     def _aligned(self, model: onnx.ModelProto) -> onnx.ModelProto:
         """Return the model with spatial attention as `quant.adapt` aligns it, and note that."""
@@ -175,12 +181,11 @@ class _Reader:
         """Return the operations from `IMAGE` to `CORRECTION`; global pooling needs a fixed size."""
         self._check_whole()
         (result,) = self.source.outputs
-        nodes = list(self.source.nodes)
-        # The host clips the result.
-        while nodes and nodes[-1].outputs[0] == result and (ends := self._limits(nodes[-1])):
-            self.limits = ends
-            result = nodes.pop().inputs[0]
-        for node in nodes:
+        result = self.end.in_core(result)
+        for node in self.source.nodes:
+            if node.outputs[0] in self.end.replaced:
+                continue
+            node.inputs = tuple(map(self.end.in_core, node.inputs))
             try:
                 self._read(node)
             except AdaptableError as error:
@@ -218,22 +223,8 @@ class _Reader:
         for node in self.source.nodes:
             if REMEDIES.get(node.op_type) in (NORMALISES, STATISTICS):
                 raise _refused(node, self.source)
-            if node.op_type == "Resize":
+            if node.op_type == "Resize" and node.outputs[0] not in self.end.replaced:
                 READERS[node.op_type](node, self.source)
-
-    def _limits(self, node: Node) -> tuple[float, ...]:
-        """Return the limits of a Clip, within those of the one behind it; empty for another node.
-
-        ReLU6 is left to the DPU.
-        """
-        ends = [self.source.value(node, place) for place in (1, 2)]
-        if node.op_type != "Clip" or any(end is None or end.size != 1 for end in ends):
-            return ()
-        low, high = (float(end.item()) for end in ends if end is not None)
-        if self.limits:
-            low = max(low, self.limits[0])
-            high = min(high, self.limits[1])
-        return (low, high) if is_range(low, high) and (low, high) != (0, SIX) else ()
 
     def _read(self, node: Node) -> None:
         if node.op_type in ACTIVATIONS:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from beers_deploy.profiles.errors import LONGEST, ModelError, printable
+from beers_deploy.quant.graph.enlargement import UNCHANGED, Enlargement
 from beers_deploy.quant.graph.operations import (
     CORRECTION,
     IMAGE,
@@ -59,6 +60,8 @@ class SplitNetwork:
         border_px: the number of pixels by which the network mirrors the image beyond its borders.
         limits: the low and the high end to which the network clips the result; empty if it does
             not.
+        activation: "Sigmoid" or "Tanh" of the result, in front of the add; empty for none.
+        enlargement: how the image is enlarged before it is added.
     """
 
     graph: Graph = field(compare=False)
@@ -69,6 +72,8 @@ class SplitNetwork:
     last: tuple[Shuffle, ...] = ()
     border_px: int = 0
     limits: tuple[float, ...] = ()
+    activation: str = ""
+    enlargement: Enlargement = UNCHANGED
 
     @property
     def core_channels(self) -> int:
@@ -114,7 +119,7 @@ def require_one_image(inputs: Collection[str], outputs: Collection[str]) -> None
         )
 
 
-def cut(graph: Graph, channels: int) -> SplitNetwork:
+def cut(graph: Graph, channels: int, with_sum: bool = True) -> SplitNetwork:
     """Split a network into the host's part at both ends, and the DPU's part between.
 
     The host gets pixel shuffles at the ends and the add of the image. Shuffles only move values,
@@ -123,6 +128,7 @@ def cut(graph: Graph, channels: int) -> SplitNetwork:
     Args:
         graph: all operations of the network, from the tensor `IMAGE` to `CORRECTION`.
         channels: the number of channels of the image.
+        with_sum: True if the host also gets an add of the image that ends the network.
 
     Raises:
         ModelError: nothing is left for the DPU.
@@ -130,7 +136,12 @@ def cut(graph: Graph, channels: int) -> SplitNetwork:
     graph, last = _without_shuffles(graph)
     end = graph[-1] if graph else None
     adds_image = False
-    if isinstance(end, Add) and IMAGE in end.inputs and end.activation is Activation.none:
+    if (
+        with_sum
+        and isinstance(end, Add)
+        and IMAGE in end.inputs
+        and end.activation is Activation.none
+    ):
         adds_image = True
         correction = end.inputs[1 - end.inputs.index(IMAGE)]
         graph, back = _without_shuffles(_ended(graph[:-1], correction))

@@ -9,6 +9,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper
 
+from beers_deploy.quant.graph.enlargement import Enlargement
 from beers_deploy.quant.graph.operations import (
     LEAKY_SLOPE,
     PLANES,
@@ -145,19 +146,24 @@ def _pool(w: GraphWriter, op: MaxPool | AveragePool, feeds: list[str], output: s
     w.node(type(op).__name__, output, feeds, op.name, **counted, **window)
 
 
-def _resize(w: GraphWriter, op: Resize, feeds: list[str], output: str) -> None:
-    scales = w.constant(
-        f"resize_by_{op.factor}", np.array([1, 1, op.factor, op.factor], np.float32)
-    )
-    bilinear = {"mode": "linear", "coordinate_transformation_mode": "half_pixel"}
-    nearest = {
-        "mode": "nearest",
-        "coordinate_transformation_mode": "asymmetric",
-        "nearest_mode": "floor",
-    }
-    w.node(
-        "Resize", output, [feeds[0], "", scales], op.name, **(bilinear if op.bilinear else nearest)
-    )
+def write_enlargement(
+    w: GraphWriter, enlargement: Enlargement, source: str, output: str, name: str = ""
+) -> None:
+    """Write an enlargement of the rows and columns of a tensor.
+
+    Args:
+        w: the writer that receives the nodes.
+        enlargement: its factor and interpolation.
+        source: the name of the tensor that is read.
+        output: the name of the result.
+        name: the name of the node; empty to use that of the result.
+    """
+    factor = enlargement.factor
+    scales = w.constant(f"resize_by_{factor}", np.array([1, 1, factor, factor], np.float32))
+    where = {"coordinate_transformation_mode": "half_pixel"}
+    if enlargement.mode == "nearest":
+        where = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+    w.node("Resize", output, [source, "", scales], name, mode=enlargement.mode, **where)
 
 
 def write_shuffle(w: GraphWriter, op: Shuffle, source: str, output: str, channels: int = 1) -> None:
@@ -193,7 +199,9 @@ _WRITERS: dict[type, Callable[..., None]] = {
     Concat: lambda w, op, feeds, output: w.node("Concat", output, feeds, op.name, axis=1),
     MaxPool: _pool,
     AveragePool: _pool,
-    Resize: _resize,
+    Resize: lambda w, op, feeds, output: write_enlargement(
+        w, Enlargement(op.factor, "linear" if op.bilinear else "nearest"), feeds[0], output, op.name
+    ),
     Shuffle: lambda w, op, feeds, output: write_shuffle(w, op, feeds[0], output),
     Pointwise: lambda w, op, feeds, output: _activation(
         w, op.activation, feeds[0], output, op.name

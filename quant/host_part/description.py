@@ -2,9 +2,10 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Any
+from typing import Any, get_args
 
 from beers_deploy.quant.graph import Shuffle
+from beers_deploy.quant.graph.enlargement import UNCHANGED, Enlargement, Mode
 from beers_deploy.quant.host_part.input_encoding import (
     BANK_SLICES,
     Direct,
@@ -17,8 +18,9 @@ from beers_deploy.quant.host_part.output_decoding import (
     OutputDecoding,
     Plain,
 )
-from beers_deploy.quant.host_part.part import HostPart, image_encoding
+from beers_deploy.quant.host_part.part import ACTIVATIONS, HostPart, image_encoding
 from beers_deploy.quant.input_range import Ranges, require_ranges
+from beers_deploy.quant.onnx.runnable import WINDOW_PX
 
 SHUFFLES = ("front", "back", "last")
 MOST_MARGIN_PX = 1024
@@ -31,10 +33,12 @@ def host_part_to_json(part: HostPart) -> dict[str, Any]:
     record = asdict(part)
     # Encoding and decoding are described by the flags that the first files had.
     del record["encoding"], record["decoding"]
-    # Files of images in [0, 1] are described as they were before there were other ranges.
-    for name in ("input_ranges", "limits"):
+    # What few networks have is described only for these.
+    for name in ("input_ranges", "limits", "activation"):
         if not record[name]:
             del record[name]
+    if part.enlargement == UNCHANGED:
+        del record["enlargement"]
     # A bank has a margin of its own, and files without one are described as they were before.
     if part.encoding != BANK_SLICES and part.encoding.margin_px:
         record["margin_px"] = part.encoding.margin_px
@@ -63,6 +67,11 @@ def host_part_from_json(record: Mapping[str, Any]) -> HostPart:
     ranges = tuple((float(low), float(high)) for low, high in record.get("input_ranges", ()))
     limits = tuple(map(float, record.get("limits", ())))
     require_ranges((*ranges, limits) if limits else ranges)
+    enlargement = Enlargement(**record.get("enlargement", {}))
+    activation = record.get("activation", "")
+    is_known = activation in ("", *ACTIVATIONS) and enlargement.mode in get_args(Mode)
+    if not is_known or not 1 <= int(enlargement.factor) <= WINDOW_PX:
+        raise ValueError(f"{enlargement} or {activation!r}, which the host does not compute")
     part = HostPart(
         channels=int(record["channels"]),
         outputs=int(record["outputs"]),
@@ -73,6 +82,8 @@ def host_part_from_json(record: Mapping[str, Any]) -> HostPart:
         decoding=_decoding(record),
         input_ranges=ranges,
         limits=limits,
+        activation=activation,
+        enlargement=enlargement,
     )
     # The file is not trusted: its core must read what the host writes, and write what it decodes.
     for key in ("planes", "gains"):

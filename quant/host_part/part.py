@@ -1,12 +1,13 @@
 """Define the host's part of an INT8 network: both sides of the integer core, in NumPy and as ONNX
 nodes.
 
-image -> pixel unshuffle -> encoding -> core -> decoding -> pixel shuffle -> + image
+image -> pixel unshuffle -> encoding -> core -> decoding -> activation -> pixel shuffle -> + image
 
 The encoding reads an image over its full scale.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,11 +21,17 @@ from beers_deploy.quant.graph import (
     SplitNetwork,
     channels_of,
 )
-from beers_deploy.quant.graph.writer import write_shuffle
+from beers_deploy.quant.graph.enlargement import UNCHANGED, Enlargement
+from beers_deploy.quant.graph.writer import write_enlargement, write_shuffle
 from beers_deploy.quant.host_part.input_encoding import ENCODED, IMAGE_SLICES, InputEncoding
 from beers_deploy.quant.host_part.output_decoding import DECODED, OutputDecoding, Plain
 from beers_deploy.quant.host_part.writer import ZERO, HostWriter
 from beers_deploy.quant.input_range import UNIT, Ranges, largest_size
+
+ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "Sigmoid": lambda values: 0.5 + 0.5 * np.tanh(0.5 * values),
+    "Tanh": np.tanh,
+}
 
 
 @dataclass(frozen=True)
@@ -47,6 +54,8 @@ class HostPart:
         input_ranges: the range (low, high) of each channel of the image; empty if all are in [0,
             1].
         limits: low and high end to which a result is clipped; empty for none but the sum above.
+        activation: "Sigmoid" or "Tanh" of the decoded result; empty for none.
+        enlargement: how the image is enlarged before it is added.
     """
 
     channels: int = 1
@@ -60,6 +69,8 @@ class HostPart:
     decoding: OutputDecoding = field(default_factory=Plain)
     input_ranges: Ranges = ()
     limits: tuple[float, ...] = ()
+    activation: str = ""
+    enlargement: Enlargement = UNCHANGED
 
     @classmethod
     def of(
@@ -86,6 +97,8 @@ class HostPart:
             input_ranges=input_ranges,
             # An image in [0, 1] is clipped when it is stored.
             limits=network.limits if input_ranges or network.limits != UNIT else (),
+            activation=network.activation,
+            enlargement=network.enlargement,
         )
 
     @property
@@ -195,8 +208,8 @@ class HostPart:
         return self.finish(image, self.decode(result, scale))
 
     def finish(self, image: np.ndarray, decoded: np.ndarray) -> np.ndarray:
-        """Compute the restored image from an image and a decoded result: shuffle, add the image,
-        and clip.
+        """Compute the restored image from an image and a decoded result: activate, shuffle, add the
+        image, and clip.
 
         Args:
             image: (N, C, H, W) in the network's units.
@@ -205,19 +218,20 @@ class HostPart:
         Returns:
             The restored image (N, C'', H'', W'') in the network's units.
         """
-        result = decoded
+        result = self.activated(decoded)
         for shuffle in self.back:
             result = shuffle(result)
-        result = self.clip(image + result if self.adds_image else result)
+        result = self.clip(self.base(image) + result if self.adds_image else result)
         for shuffle in self.last:
             result = shuffle(result)
         return result
 
     def correction_of(self, image: np.ndarray, restored: np.ndarray) -> np.ndarray:
-        """Return the decoded result for which `finish` returns a given restored image, unless it
+        """Return the activated result for which `finish` returns a given restored image, unless it
         clips.
 
-        This is the inverse of `finish`. Fine-tuning computes its targets with it.
+        This is the inverse of `finish` behind `activated`. Fine-tuning computes its targets with
+        it.
 
         Args:
             image: (N, C, H, W) in the network's units.
@@ -226,10 +240,21 @@ class HostPart:
         result = restored
         for shuffle in reversed(self.last):
             result = shuffle.inverse(result)
-        result = result - image if self.adds_image else result
+        result = result - self.base(image) if self.adds_image else result
         for shuffle in reversed(self.back):
             result = shuffle.inverse(result)
         return np.ascontiguousarray(result)
+
+    def activated(self, decoded: np.ndarray) -> np.ndarray:
+        """Return the activation of a decoded result; the result itself if there is none."""
+        if not self.activation:
+            return decoded
+        # In float64, so that NumPy and onnxruntime round to the same float32.
+        return ACTIVATIONS[self.activation](decoded.astype(np.float64)).astype(np.float32)
+
+    def base(self, image: np.ndarray) -> np.ndarray:
+        """Return an image (N, C, H, W) as it is added to a result: enlarged, if it is."""
+        return self.enlargement(image) if self.enlargement.factor > 1 else image
 
     def clip(self, result: np.ndarray) -> np.ndarray:
         """Clip a result to `clip_limits`, as the host does; return it unchanged if there are no
@@ -280,13 +305,21 @@ class HostPart:
         """
         self.decoding.write(w, feeds, self.outputs, scale)
         result = DECODED
+        if self.activation:
+            wide = w.node("Cast", "host_back.float64", [result], to=TensorProto.DOUBLE)
+            wide = w.node(self.activation, "host_back.activated_float64", [wide])
+            result = w.node("Cast", "host_back.activated", [wide], to=TensorProto.FLOAT)
         for k, shuffle in enumerate(self.back):
             write_shuffle(w, shuffle, result, f"host_back.shuffled_{k}")
             result = f"host_back.shuffled_{k}"
         if self.unit != 1:
             result = w.node("Mul", "host_back.in_units", [result, w.scalar("unit", self.unit)])
         if self.adds_image:
-            result = w.node("Add", "host_back.add", [IMAGE, result])
+            base = IMAGE
+            if self.enlargement.factor > 1:
+                base = "host_back.enlarged"
+                write_enlargement(w, self.enlargement, IMAGE, base)
+            result = w.node("Add", "host_back.add", [base, result])
         name = "host_back.clipped" if self.last else "restored"
         if self.clip_limits:
             low, high = self.clip_limits

@@ -74,6 +74,10 @@ def to_int8(values: Tensor, low: int = INT8_MIN, high: int = INT8_MAX) -> Tensor
     return clipped
 
 
+ACTIVATIONS = {"Sigmoid": torch.sigmoid, "Tanh": torch.tanh}
+"""The host's activations (`host_part.part.ACTIVATIONS`), for autograd."""
+
+
 class TrainableCore(torch.nn.Module):
     """An integer core in torch, whose weights and biases are trained while all scales are fixed.
 
@@ -144,6 +148,17 @@ class TrainableCore(torch.nn.Module):
         # Clipped numbers start at the end of int8, where the gradient is not 0.
         numbers[number].data.mul_(2.0**by).clamp_(INT8_MIN, INT8_MAX)
         return copy
+
+    def activated(self, planes: Tensor) -> Tensor:
+        """Compute what the host adds to the image, (N, C, H, W): the core's result, behind the
+        host's activation if there is one.
+
+        Args:
+            planes: the int8 planes (N, P, H, W) of images, as float32.
+        """
+        result: Tensor = self(planes)
+        activation = self._core.host_part.activation
+        return ACTIVATIONS[activation](result) if activation else result
 
     def forward(self, planes: Tensor) -> Tensor:
         """Compute the core's result, (N, C, H, W) in real values, for the int8 planes (N, P, H, W)

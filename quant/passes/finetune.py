@@ -268,7 +268,7 @@ def descend(
         drawn = torch.randint(len(samples), (count,), generator=generator).tolist()
         for batch in _batches([samples[number] for number in drawn]):
             share = len(batch.planes) / count
-            error = share * batch.error(trainable(batch.planes))
+            error = share * batch.error(trainable.activated(batch.planes))
             error.backward()  # type: ignore[no-untyped-call]
         for parameter, mean, mean_square in zip(parameters, means, mean_squares, strict=True):
             gradient = cast(Tensor, parameter.grad)
@@ -333,7 +333,8 @@ def _samples(host_part: HostPart, full: Graph, tuning: Tuning) -> Iterator[Sampl
     original = None if tuning.original is None else open_any_size(tuning.original)
     for image, reference in tuning.pairs:
         if original is None:
-            ((floats,),) = tensor_values(session, [CORRECTION], image, None, host_part)
+            ((decoded,),) = tensor_values(session, [CORRECTION], image, None, host_part)
+            floats = host_part.activated(decoded)
         else:
             floats = host_part.correction_of(image, result_of(original, image))
         planes = torch.from_numpy(host_part.encode(image).astype(np.float32)).to(

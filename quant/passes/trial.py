@@ -119,7 +119,8 @@ def search_targets(
 
     def size(crop: np.ndarray) -> float:
         result = restored(crop)
-        return float(np.abs(result - crop if result.shape == crop.shape else result).max())
+        base = host_part.base(crop) if host_part.adds_image else crop
+        return float(np.abs(result - base if result.shape == base.shape else result).max())
 
     # 1.
     sizes = {}

@@ -186,6 +186,26 @@ def affine_of(graph: OnnxGraph, node: Node) -> tuple[str, Affine] | None:
     return None
 
 
+def affine_chain(graph: OnnxGraph, name: str, is_sole: bool = True) -> tuple[str, Affine]:
+    """Return the tensor that scalings and shifts by constants make another of, and what they do
+    together.
+
+    Args:
+        graph: the graph.
+        name: the tensor that they result in.
+        is_sole: True to follow only tensors that nothing else reads.
+    """
+    one = np.ones(1)
+    total = Affine(one, 0 * one)
+    while True:
+        writer = graph.sole_writer(name) if is_sole else graph.writers.get(name)
+        match = None if writer is None else affine_of(graph, writer)
+        if match is None:
+            return name, total
+        name, affine = match
+        total = Affine(total.scale * affine.scale, total.scale * affine.shift + total.shift)
+
+
 def _arithmetic(kind: str, value: np.ndarray, place: int) -> Affine | None:
     """Return scale and shift of arithmetic with one constant per channel on the operand at this
     place.

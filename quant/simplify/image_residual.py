@@ -18,7 +18,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
-from beers_deploy.quant.simplify.fold_affine import Affine, affine_of
+from beers_deploy.quant.simplify.fold_affine import Affine, affine_chain
 
 SAME = 1e-6
 """The relative error of constants that undo one another: a few roundings of float32."""
@@ -37,7 +37,7 @@ def clip_last(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """
     if node.outputs[0] not in graph.outputs:
         return None
-    source, affine = _chain(graph, node.outputs[0])
+    source, affine = affine_chain(graph, node.outputs[0])
     clip = graph.sole_writer(source)
     if source == node.outputs[0] or clip is None or clip.op_type != "Clip":
         return None
@@ -73,12 +73,12 @@ def add_to_image(graph: OnnxGraph, node: Node) -> list[Node] | None:
     Returns:
         A product and the sum; None if the node does not undo the normalisation of the image.
     """
-    source, behind = _chain(graph, node.outputs[0])
+    source, behind = affine_chain(graph, node.outputs[0])
     total = graph.writers.get(source)
     if source == node.outputs[0] or total is None or total.op_type != "Add":
         return None
     for place, name in enumerate(total.inputs):
-        image, before = _chain(graph, name, is_sole=False)
+        image, before = affine_chain(graph, name, is_sole=False)
         if image in graph.inputs and name != image and _undoes(behind, before, graph.inputs[image]):
             result = node.outputs[0]
             factor = graph.add_constant(f"{result}.scale", behind.scale.reshape(1, -1, 1, 1))
@@ -97,23 +97,3 @@ def _undoes(behind: Affine, before: Affine, sizes: Sequence[int]) -> bool:
     is_same = np.allclose(scale, 1, 0, SAME) and np.allclose(shifts[0], -shifts[1], SAME, SAME)
     # A grey image may get channels by its normalisation.
     return len(sizes) == 4 and max(behind.channels, before.channels) in (1, sizes[1]) and is_same
-
-
-def _chain(graph: OnnxGraph, name: str, is_sole: bool = True) -> tuple[str, Affine]:
-    """Return the tensor that scalings and shifts by constants make another of, and what they do
-    together.
-
-    Args:
-        graph: the graph.
-        name: the tensor that they result in.
-        is_sole: True to follow only tensors that nothing else reads.
-    """
-    one = np.ones(1)
-    total = Affine(one, 0 * one)
-    while True:
-        writer = graph.sole_writer(name) if is_sole else graph.writers.get(name)
-        match = None if writer is None else affine_of(graph, writer)
-        if match is None:
-            return name, total
-        name, affine = match
-        total = Affine(total.scale * affine.scale, total.scale * affine.shift + total.shift)

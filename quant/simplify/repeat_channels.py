@@ -1,7 +1,8 @@
 """Repeat channels by convolutions of one pixel, where a network repeats them or leaves it to ONNX.
 
 A DPU adds and multiplies maps of one number of channels. A map of one channel that meets several is
-repeated first, as a Tile along the channels does. Both are exact.
+repeated first, as a Tile along the channels does. Channels of the image that a Concat repeats come
+from one convolution as well. All of it is exact.
 """
 
 import numpy as np
@@ -44,6 +45,36 @@ def repeat_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] 
     repeated = graph.convolution(narrow, name, name, np.ones((channels, 1, 1, 1)))
     node.inputs = tuple(name if each == narrow else each for each in node.inputs)
     return [repeated, node]
+
+
+def join_copies(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Let one convolution write the channels of the image that a Concat joins, such as copies.
+
+    Args:
+        graph: the graph that the node belongs to; its constants are extended.
+        node: any node.
+
+    Returns:
+        The convolution; None if the node joins anything else.
+    """
+    (image, *_) = graph.inputs
+    if node.op_type != "Concat" or node.attributes.get("axis") != 1:
+        return None
+    weights = []
+    for name in node.inputs:
+        conv = graph.writers.get(name)
+        if name == image:
+            weights.append(np.eye(graph.inputs[image][1])[:, :, None, None])
+        elif conv is not None and conv.op_type == "Conv" and conv.inputs[0] == image:
+            weights.append(graph.constants[conv.inputs[1]])
+        else:
+            return None
+        is_plain = conv is None or (
+            len(conv.inputs) == 2 and not conv.attributes.get("group", 1) > 1
+        )
+        if weights[-1].shape[2:] != (1, 1) or not is_plain:
+            return None
+    return [graph.convolution(image, node.outputs[0], node.name, np.concatenate(weights))]
 
 
 def broadcasts_channels(model: onnx.ModelProto) -> bool:

@@ -64,11 +64,16 @@ from beers_deploy.quant.simplify.image_residual import add_to_image, clip_last
 from beers_deploy.quant.simplify.large_kernels import split_large_kernel
 from beers_deploy.quant.simplify.missing_border import with_missing_border
 from beers_deploy.quant.simplify.pixel_slices import convolve_slice
-from beers_deploy.quant.simplify.repeat_channels import broadcasts_channels, repeat_channels
+from beers_deploy.quant.simplify.repeat_channels import (
+    broadcasts_channels,
+    join_copies,
+    repeat_channels,
+)
 from beers_deploy.quant.simplify.spelled_activations import (
     halve_before_gelu,
     join_clips,
     join_hard_swish,
+    join_sigmoid,
 )
 from beers_deploy.quant.simplify.split_channels import read_unselected, split_channels
 from beers_deploy.quant.simplify.standard_operators import (
@@ -166,6 +171,7 @@ def _run_passes(model: onnx.ModelProto) -> None:
         halve_before_gelu,
         partial(add_negated, float_shapes(graph)),
         add_to_image,
+        join_sigmoid,
         fold_behind,
         without_groups,
         split_large_kernel,
@@ -189,6 +195,7 @@ def _run_passes(model: onnx.ModelProto) -> None:
     graph.rewrite(fold_behind)
     fold_in_front(graph, shapes)
     graph.rewrite(partial(read_unselected, shapes))
+    graph.rewrite(join_copies)
     graph.rewrite(ConnectByConvolutions(shapes))
     graph.save()
 

@@ -3,7 +3,8 @@
 1. Clip, Max, Min and ReLU, also one after the other, are ReLU, or ReLU6 of a scaled map.
 2. A shift by 3, a clip from 0 to 6 and a sixth are HardSigmoid. They are HardSwish if they are
    multiplied by the tensor itself, in any order.
-3. GELU, x (1 + Erf(x / sqrt(2))) / 2, stays spelled out, but its half comes first. Behind the
+3. (Tanh(x) + 1) / 2 is Sigmoid(2 x).
+4. GELU, x (1 + Erf(x / sqrt(2))) / 2, stays spelled out, but its half comes first. Behind the
    product it would be folded into the next convolution, and nobody would recognise the rest.
 """
 
@@ -13,6 +14,7 @@ from math import sqrt
 import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.simplify.fold_affine import affine_chain
 
 UNLIMITED = 1e30
 """A Clip above this value limits nothing."""
@@ -118,8 +120,32 @@ def join_hard_swish(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return None if source is None else [Node.new("HardSwish", [source], result, node.name)]
 
 
+def join_sigmoid(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace (Tanh(x) + 1) / 2, in any spelling, by Sigmoid(2 x) (point 3 of the module).
+
+    Args:
+        graph: the graph that the node belongs to; its constants are extended.
+        node: any node; only the last of the arithmetic is replaced.
+
+    Returns:
+        A product and the Sigmoid; None if the node is something else.
+    """
+    result = node.outputs[0]
+    source, affine = affine_chain(graph, result)
+    tanh = graph.sole_writer(source)
+    is_half = (affine.scale == 0.5).all() and (affine.shift == 0.5).all()
+    if tanh is None or tanh.op_type != "Tanh" or not is_half:
+        return None
+    doubled = f"{result}.doubled"
+    two = graph.add_constant(f"{result}.two", np.array(2.0))
+    return [
+        Node.new("Mul", [tanh.inputs[0], two], doubled, doubled),
+        Node.new("Sigmoid", [doubled], result, node.name),
+    ]
+
+
 def halve_before_gelu(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Move the factor 1/2 of a GELU, x (1 + Erf(x / sqrt(2))) / 2, in front of the product (point 3
+    """Move the factor 1/2 of a GELU, x (1 + Erf(x / sqrt(2))) / 2, in front of the product (point 4
     of the module).
 
     Args:

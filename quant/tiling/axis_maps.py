@@ -237,8 +237,8 @@ def _slice(at: AxisNode) -> AxisMap:
 def _resize(at: AxisNode) -> AxisMap:
     """Return the map of a Resize by an integer factor, or by the inverse of one.
 
-    Linear interpolation is accepted only if all weights are exact floats. Raises ModelError for
-    anything else.
+    Linear and cubic interpolation are accepted only if all weights are exact floats. Raises
+    ModelError for anything else.
     """
     resizing = Resizing.of(at.node, at.graph)
     at.require(bool(resizing.factors), "resizes to a fixed size")
@@ -257,22 +257,25 @@ def _resize(at: AxisNode) -> AxisMap:
         growth > 1 or resizing.where != "pytorch_half_pixel",
         "uses coordinates that depend on the size",
     )
-    linear = resizing.mode == "linear"
+    blends = resizing.mode != "nearest"
     antialias = " with antialiasing" if at.attribute("antialias", 0) else ""
     at.require(
-        not antialias and (linear or resizing.mode == "nearest"),
+        not antialias,
         f"resizes in mode {resizing.mode}{antialias}",
     )
     # Weights that are multiples of a power of two are exact floats, so that the same sum is rounded
     # alike at every place.
-    exact = not linear or growth.numerator & (growth.numerator - 1) == 0
+    exact = not blends or growth.numerator & (growth.numerator - 1) == 0
     at.require(exact, f"resizes by {growth} with weights whose rounding depends on the position")
-    ways = (math.floor, math.ceil) if linear else (ROUNDINGS[resizing.rounding],)
+    ways = (math.floor, math.ceil) if blends else (ROUNDINGS[resizing.rounding],)
     # The offsets repeat after the number of pixels that one pixel of the source becomes.
     pixels = range(growth.numerator)
     places = [(k / growth, PLACES[resizing.where](k, float(growth))) for k in pixels]
     offsets = [way(place) - share for way, (share, place) in product(ways, places)]
-    return AxisMap(growth, math.floor(at.extra * growth), min(offsets), max(offsets))
+    # Cubic interpolation reads one pixel more on either side.
+    more = int(resizing.mode == "cubic")
+    low = min(offsets) - more
+    return AxisMap(growth, math.floor(at.extra * growth), low, max(offsets) + more)
 
 
 AXIS_MAPS: dict[str, Callable[[AxisNode], AxisMap]] = {

@@ -62,6 +62,8 @@ def test_a_description_states_the_whole_host_part(part: HostPart) -> None:
         {"planes": 5},
         {"planes": None},
         {"gains": 0},
+        {"activation": "Exp"},
+        {"enlargement": {"factor": 0}},
     ],
 )
 def test_a_damaged_description_is_refused(damage: dict[str, Any]) -> None:

@@ -235,9 +235,11 @@ def _reached(operations: Sequence[Operation], starts: set[str], *, forwards: boo
 def _is_host_front(op: Operation, network: SizedGraph, *, trails: bool) -> bool:
     """Return True if a node before the core belongs to the host.
 
-    In a quantised file that is every such node; in a float file scaling, mirroring, and pixels to
-    channels.
+    In a quantised file that is every such node; in a float file scaling, mirroring, pixels to
+    channels, and an enlargement of the image that no convolution reads.
     """
+    of_image = op.op_type == "Resize" and op.inputs[0] in network.inputs
+    enlarges = of_image and trails and op.output not in network.outputs
     # The DPU does not pad by reflection: the host mirrors the image.
     mirrors = (
         op.op_type == "Pad"
@@ -245,7 +247,7 @@ def _is_host_front(op: Operation, network: SizedGraph, *, trails: bool) -> bool:
         and op.attributes.get("mode") == "reflect"
     )
     moves = (op.op_type == "SpaceToDepth" or mirrors) and not trails
-    return network.quantized or op.op_type in SCALING or moves
+    return network.quantized or op.op_type in SCALING or moves or enlarges
 
 
 def _is_host_back(op: Operation, network: SizedGraph, *, leads: bool) -> bool:

@@ -39,7 +39,9 @@ from tests.deploy.command_line import done
 from tests.deploy.kit.test_golden import NORMALISED, network
 from tests.model.networks import behind_a_bank
 from tests.profiles.own_sensor import edited, own_sensor
+from tests.quant.quick import patches_of, quickly
 from tests.quant.sensor_bank.test_filters import textured
+from tests.quant.test_host_end import float_network
 
 BARE = """
 import sys
@@ -64,15 +66,32 @@ def behind_fitted_kernels() -> bd.Network:
     return bd.Network.load(host_model(family.core, {}))
 
 
+def with_host_end() -> bd.Network:
+    """Return a network to whose Tanh the host adds the enlarged image."""
+    network = float_network("Tanh of the correction of the enlarged image")
+    raw = np.random.default_rng(0).random((1, 2, 40, 40), dtype=np.float32)
+    return bd.Network.load(quickly(network, patches_of([raw])).host)
+
+
 @pytest.mark.parametrize(
     "name",
-    ["convbeers-xs-int8", "convbeers-half-xs-int8", "unet", "espcn", "fitted kernels", NORMALISED],
+    [
+        "convbeers-xs-int8",
+        "convbeers-half-xs-int8",
+        "unet",
+        "espcn",
+        "fitted kernels",
+        "host end",
+        NORMALISED,
+    ],
 )
 def test_the_host_part_gives_the_host_files_bytes(name: str, tmp_path: Path) -> None:
     """The host part needs only NumPy and onnxruntime, and restores an image of odd sides."""
-    int8 = behind_fitted_kernels() if name == "fitted kernels" else network(name)
+    own = {"fitted kernels": behind_fitted_kernels, "host end": with_host_end}
+    int8 = own[name]() if name in own else network(name)
     folder = bd.Board.load("vck190").kit(int8, tmp_path / "kit", tile=96)
-    image = np.random.default_rng(1).random((1, 131, 203), dtype=np.float32)
+    shape = int8.tiling.channels_in, 131, 203
+    image = np.random.default_rng(1).random(shape, dtype=np.float32)
     image = 2 * image - 1 if name == NORMALISED else image
     np.save(tmp_path / "image.npy", image)
     files = [str(tmp_path / "image.npy"), str(tmp_path / "out.npy")]

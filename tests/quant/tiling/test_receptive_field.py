@@ -90,6 +90,7 @@ EXACT = {
     ),
     f"restored = Resize<{HALF_PIXEL}>(image, , double)": Tiling(0, 1, Fraction(2)),
     f'restored = Resize<mode="linear", {HALF_PIXEL}>(image, , double)': Tiling(1, 1, Fraction(2)),
+    f'restored = Resize<mode="cubic", {HALF_PIXEL}>(image, , double)': Tiling(2, 1, Fraction(2)),
     f'restored = Resize<mode="linear", {HALF_PIXEL}>(image, , half)': Tiling(0, 2, Fraction(1, 2)),
     """c = ConvTranspose<strides=[2,2], dilations=[3,3], pads=[1,1,1,1]>(image, w2)
     restored = MaxPool<kernel_shape=[2,2], pads=[0,0,1,1]>(c)""": Tiling(1, 1, Fraction(2)),

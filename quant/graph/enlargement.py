@@ -1,0 +1,63 @@
+"""Enlarge the image to which a network for super-resolution adds its result.
+
+The host does it in float, as ONNX's Resize and torch's `interpolate` do.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+Mode = Literal["nearest", "linear", "cubic"]
+"""The interpolation of an enlargement, in ONNX's words."""
+REACH_PX = 2
+"""The number of pixels around a pixel's own that an enlargement reads at most."""
+CUBIC = -0.75
+"""The coefficient a of cubic convolution in torch and in ONNX's default."""
+
+
+@dataclass(frozen=True)
+class Enlargement:
+    """The enlargement of the image, to which a network adds its result.
+
+    Attributes:
+        factor: the factor of rows and columns; 1 leaves the image as it is.
+        mode: the interpolation, with half-pixel centres and repeated borders.
+    """
+
+    factor: int = 1
+    mode: Mode = "nearest"
+
+    @property
+    def weights(self) -> np.ndarray:
+        """The weights (factor, 2 REACH_PX + 1) float32 of the pixels around a pixel, for each
+        of the pixels that it becomes along an axis.
+        """
+        places = (np.arange(self.factor) + 0.5) / self.factor - 0.5
+        if self.mode == "nearest":
+            places = np.zeros(self.factor)
+        distances = np.abs(np.arange(-REACH_PX, REACH_PX + 1) - places[:, None])
+        if self.mode != "cubic":
+            return np.maximum(1 - distances, 0).astype(np.float32)
+        # R. Keys, "Cubic convolution interpolation for digital image processing", IEEE TASSP 1981.
+        near = (CUBIC + 2) * distances**3 - (CUBIC + 3) * distances**2 + 1
+        far = CUBIC * (distances**3 - 5 * distances**2 + 8 * distances - 4)
+        return np.where(distances <= 1, near, np.where(distances < 2, far, 0)).astype(np.float32)
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        """Return an image (N, C, H, W) enlarged to (N, C, factor H, factor W)."""
+        for _ in range(2):
+            # Once along the rows, once along the columns.
+            count, channels, height, width = image.shape
+            wide = np.pad(image, [(0, 0), (0, 0), (REACH_PX, REACH_PX), (0, 0)], "edge")
+            phases = [
+                sum(weight * wide[:, :, k : k + height] for k, weight in enumerate(phase))
+                for phase in self.weights
+            ]
+            tall = np.stack(phases, axis=3).reshape(count, channels, self.factor * height, width)
+            image = tall.swapaxes(2, 3)
+        return image
+
+
+UNCHANGED = Enlargement()
+"""The enlargement that leaves an image as it is."""

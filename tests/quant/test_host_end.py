@@ -1,0 +1,149 @@
+"""Tests of what the host computes at a network's end: an activation, and the enlarged image."""
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from numpy.testing import assert_allclose
+
+from beers_deploy.quant.encodings import encoding_faults
+from beers_deploy.quant.graph import IMAGE, read_network, read_planes
+from beers_deploy.quant.graph.enlargement import UNCHANGED, Enlargement, Mode
+from beers_deploy.quant.graph.writer import write_enlargement
+from beers_deploy.quant.host_part import HostPart, Plain
+from beers_deploy.quant.integer.agreement import agreement
+from beers_deploy.quant.onnx.image_input import image_info
+from beers_deploy.quant.onnx_file import GraphWriter, make_model
+from beers_deploy.quant.session import open_session, result_of
+from beers_deploy.quant.simplify.simplify import simplify
+from tests.quant.quick import in_float, patches_of, quickly
+from tests.quant.simplify.networks import parsed
+from tests.quant.tiling.small_networks import check_tiles
+
+RANDOM = np.random.default_rng(2)
+CONSTANTS = {
+    "into": RANDOM.normal(0, 0.3, (6, 2, 3, 3)),
+    "two": RANDOM.normal(0, 0.2, (2, 6, 3, 3)),
+    "eight": RANDOM.normal(0, 0.2, (8, 6, 3, 3)),
+    "double": [1.0, 1.0, 2.0, 2.0],
+    "half": 0.5,
+    "zero": [0],
+    "one": [1],
+    "ends": [2],
+    "low": 0.0,
+    "high": 1.0,
+}
+PADS = "<pads=[1,1,1,1]>"
+FEATURES = f"a = Conv{PADS}(image, into) b = Relu(a)"
+SHUFFLED = f'{FEATURES} c = Conv{PADS}(b, eight) d = DepthToSpace<blocksize=2, mode="CRD">(c)'
+PLAIN = f"{FEATURES} c = Conv{PADS}(b, two)"
+HALF_PIXEL = 'coordinate_transformation_mode="half_pixel"'
+BLOCKS = 'coordinate_transformation_mode="asymmetric", nearest_mode="floor"'
+ENDS = {
+    "nearest": (
+        f"{SHUFFLED} e = Resize<{BLOCKS}>(image, , double) restored = Add(d, e)",
+        ("", Enlargement(2), True),
+    ),
+    "bilinear, clipped": (
+        f"""{PLAIN} d = Resize<{BLOCKS}>(c, , double)
+        e = Resize<mode="linear", {HALF_PIXEL}>(image, , double)
+        f = Add(e, d) restored = Clip(f, low, high)""",
+        ("", Enlargement(2, "linear"), True),
+    ),
+    "bicubic": (
+        f"""{SHUFFLED} e = Resize<mode="cubic", {HALF_PIXEL}>(image, , double)
+        restored = Add(d, e)""",
+        ("", Enlargement(2, "cubic"), True),
+    ),
+    "repeated channels": (
+        f"""{FEATURES} c = Conv{PADS}(b, eight)
+        x = Slice(image, zero, one, one) y = Slice(image, one, ends, one)
+        e = Concat<axis=1>(x, x, x, x, y, y, y, y)
+        f = Add(c, e) restored = DepthToSpace<blocksize=2, mode="CRD">(f)""",
+        ("", Enlargement(2), True),
+    ),
+    "Sigmoid": (f"{SHUFFLED} restored = Sigmoid(d)", ("Sigmoid", UNCHANGED, False)),
+    "Tanh in the range of Sigmoid": (
+        f"{PLAIN} d = Tanh(c) e = Add(d, high) restored = Mul(half, e)",
+        ("Sigmoid", UNCHANGED, False),
+    ),
+    "Tanh of the correction": (
+        f"{PLAIN} d = Tanh(c) restored = Add(image, d)",
+        ("Tanh", UNCHANGED, True),
+    ),
+    "Tanh of the correction of the enlarged image": (
+        f"""{SHUFFLED} e = Tanh(d) f = Resize<{BLOCKS}>(image, , double)
+        restored = Add(f, e)""",
+        ("Tanh", Enlargement(2), True),
+    ),
+    "Sigmoid of a sum with the image": (
+        f"{PLAIN} d = Add(image, c) restored = Sigmoid(d)",
+        ("Sigmoid", UNCHANGED, False),
+    ),
+}
+
+
+def float_network(name: str) -> onnx.ModelProto:
+    nodes, _ = ENDS[name]
+    ends = "float[N,2,H,W] image => float[N,2,P,Q] restored"
+    return simplify(parsed(nodes, ends, constants=CONSTANTS), name)
+
+
+def image(height: int, width: int, seed: int = 0) -> np.ndarray:
+    """Draw digital numbers of 12 bits as shares of full scale, (1, 2, height, width)."""
+    dn = np.random.default_rng(seed).integers(0, 4096, (1, 2, height, width))
+    return dn.astype(np.float32) / np.float32(4095)
+
+
+@pytest.mark.parametrize("name", ENDS)
+def test_the_host_takes_the_end_and_nothing_changes_in_float(name: str) -> None:
+    network = read_network(float_network(name))
+    activation, enlargement, adds_image = ENDS[name][1]
+    assert network.activation == activation
+    assert network.enlargement == enlargement
+    assert network.adds_image == adds_image
+    part = HostPart.of(network, Plain())
+    raw = image(9, 14)
+    correction = in_float(read_planes(network.graph), raw, part)
+    expected = part.clip(result_of(open_session(float_network(name)), raw))
+    assert_allclose(part.finish(raw, correction), expected, atol=1e-5)
+    # Fine-tuning computes its targets by the inverse, where nothing is clipped.
+    restored = replace(part, limits=(-9.0, 9.0)).finish(raw, correction)
+    assert_allclose(part.correction_of(raw, restored), part.activated(correction), atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ENDS)
+def test_int8_files_end_as_the_host_part_does(name: str) -> None:
+    raw = [image(24, 40, seed) for seed in range(3)]
+    int8 = quickly(float_network(name), patches_of(raw[:2]))
+    assert encoding_faults(int8.host) == []
+    part = int8.core.host_part
+    expected = part.finish(raw[2], agreement(int8.core, int8.host, raw[2]).even)
+    restored = result_of(open_session(int8.host), raw[2])
+    assert_allclose(restored, expected, atol=1e-6)
+    in_float = part.clip(result_of(open_session(float_network(name)), raw[2]))
+    # A sum inside the core has 8 bits.
+    assert np.abs(restored - in_float).mean() < 0.01
+    check_tiles(int8.host, raw[2], (16, 24))
+
+
+@pytest.mark.parametrize(
+    ("mode", "factor"),
+    [("nearest", 3), *product(("linear", "cubic"), (2, 4))],
+)
+def test_enlargement_equals_torch_and_the_runtime(mode: Mode, factor: int) -> None:
+    raw = image(7, 11)
+    names = {"nearest": "nearest", "linear": "bilinear", "cubic": "bicubic"}
+    expected = torch.nn.functional.interpolate(
+        torch.from_numpy(raw), scale_factor=factor, mode=names[mode]
+    )
+    enlargement = Enlargement(factor, mode)
+    assert_allclose(enlargement(raw), expected.numpy(), atol=1e-6)
+    writer = GraphWriter()
+    write_enlargement(writer, enlargement, IMAGE, "restored")
+    result = onnx.helper.make_tensor_value_info("restored", onnx.TensorProto.FLOAT, None)
+    model = make_model(writer.graph("g", [image_info(IMAGE, 2, None)], [result]), {})
+    assert_allclose(result_of(open_session(model), raw), expected.numpy(), atol=1e-6)
