@@ -111,8 +111,12 @@ ACTIVATIONS: dict[str, Any] = {
 """Functions of a decoded result, by the name in host.json."""
 
 
-def enlarged(image: np.ndarray) -> np.ndarray:
-    """Enlarge a tile (1, C, h, w) by a factor, from which each row of the weights has a pixel."""
+def base(image: np.ndarray) -> np.ndarray:
+    """Make the base that a result is added to of a tile (1, C, h, w): some channels, enlarged.
+
+    Each row of the weights gives one of the pixels that a pixel becomes along an axis.
+    """
+    image = image[:, S["added_channels"]]
     weights = np.array(S["enlargement"], F)
     factor, taps = weights.shape
     if factor == 1:
@@ -139,7 +143,7 @@ def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
         value = ACTIVATIONS[S["activation"]](value.astype(np.float64)).astype(F)
     value = shuffled(value, S["back"], up=True) * F(unit)
     if S["adds_image"]:
-        value = enlarged(image) + value
+        value = base(image) + value
     if S["limits"]:
         value = np.clip(value, *S["limits"])
     return shuffled(value, S["last"], up=True)

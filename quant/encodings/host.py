@@ -43,6 +43,7 @@ from beers_deploy.quant.graph import (
     Window,
     channels_of,
 )
+from beers_deploy.quant.graph.base import THE_IMAGE
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
 from beers_deploy.quant.graph.writer import window_attributes, write_float, write_shuffle
 from beers_deploy.quant.host_part import ZERO, HostWriter
@@ -135,7 +136,7 @@ def live_tensors(core: IntCore, at: int) -> list[str]:
 
 def _result(core: IntCore, tile_px: int | None) -> onnx.ValueInfoProto:
     host_part = core.host_part
-    if host_part.adds_image and not host_part.last and host_part.enlargement.factor == 1:
+    if host_part.adds_image and not host_part.last and host_part.base == THE_IMAGE:
         return image_info("restored", host_part.image_channels, tile_px)
     shuffles = (*host_part.back, *host_part.last)
     squares = math.prod(shuffle.block**2 for shuffle in shuffles)

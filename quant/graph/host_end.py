@@ -1,21 +1,20 @@
 """Find what the host computes at the end of a float network, behind the core's result.
 
-    core -> Sigmoid or Tanh -> + enlarged image -> Clip
+    core -> Sigmoid or Tanh -> + base -> Clip
 
 1. Clips to constant limits, which come last.
-2. The sum with the enlarged image, as networks for super-resolution add it to their detail. A sum
-   in front of a pixel shuffle, with channels that repeat the image's, is one with the image whose
-   pixels are repeated.
+2. The sum with a base: some channels of the image, or the enlarged image. A sum in front of a pixel
+   shuffle, with channels that repeat the image's, is one with the image whose pixels are repeated.
 3. A Sigmoid or a Tanh behind that; or one to whose result the image itself is added.
 
 A DPU would compute the first two in 8 bits, and not compute the third.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from beers_deploy.quant.graph.enlargement import CUBIC, Enlargement, Mode
+from beers_deploy.quant.graph.base import CUBIC, THE_IMAGE, Base, Mode
 from beers_deploy.quant.graph.node_operations import READERS
 from beers_deploy.quant.graph.operations import SIX, Shuffle
 from beers_deploy.quant.graph.resize import Resizing
@@ -33,8 +32,7 @@ class HostEnd:
         replaced: for the result of each node that the host computes, the tensor that takes its
             place in the core.
         limits: low and high end to which the network clips its result; empty if it does not.
-        enlargement: how the image is enlarged that the network adds; None if it adds none, or the
-            image itself.
+        base: what the network adds its result to; None for nothing, or the image itself.
         activation: "Sigmoid" or "Tanh"; empty if there is none.
         adds_in_core: True if a sum with the image that ends the core is not the last sum, so that
             the host does not compute it.
@@ -42,7 +40,7 @@ class HostEnd:
 
     replaced: dict[str, str]
     limits: tuple[float, ...] = ()
-    enlargement: Enlargement | None = None
+    base: Base | None = None
     activation: str = ""
     adds_in_core: bool = False
 
@@ -69,24 +67,24 @@ def host_end(graph: OnnxGraph) -> HostEnd:
         replaced[result] = graph.writers[result].inputs[0]
         result = replaced[result]
     # 2.
-    enlargement, nodes = _enlarged_sum(graph, result, image)
+    base, nodes = _sum_with_base(graph, result, image)
     replaced |= nodes
     result = replaced.get(result, result)
     # 3.
     last = graph.sole_writer(result)
     adds_image = last is not None and last.op_type == "Add" and image in last.inputs
     activation = last
-    if adds_image and last is not None and enlargement is None:
+    if adds_image and last is not None and base is None:
         activation = graph.sole_writer(last.inputs[1 - last.inputs.index(image)])
     if (
         activation is None
         or activation.op_type not in ACTIVATIONS
         or activation.inputs[0] in graph.inputs
     ):
-        return HostEnd(replaced, limits, enlargement, "", enlargement is not None)
+        return HostEnd(replaced, limits, base, "", base is not None)
     replaced[activation.outputs[0]] = activation.inputs[0]
-    is_last = enlargement is not None or not adds_image
-    return HostEnd(replaced, limits, enlargement, activation.op_type, is_last)
+    is_last = base is not None or not adds_image
+    return HostEnd(replaced, limits, base, activation.op_type, is_last)
 
 
 def _limits(graph: OnnxGraph, result: str, limits: tuple[float, ...]) -> tuple[float, ...]:
@@ -108,10 +106,8 @@ def _limits(graph: OnnxGraph, result: str, limits: tuple[float, ...]) -> tuple[f
     return (low, high) if is_range(low, high) and (low, high) != (0, SIX) else ()
 
 
-def _enlarged_sum(
-    graph: OnnxGraph, result: str, image: str
-) -> tuple[Enlargement | None, dict[str, str]]:
-    """Find the sum with the enlarged image that a tensor is (point 2).
+def _sum_with_base(graph: OnnxGraph, result: str, image: str) -> tuple[Base | None, dict[str, str]]:
+    """Find the sum with a base, other than the image itself, that a tensor is (point 2).
 
     Args:
         graph: the float network.
@@ -119,8 +115,8 @@ def _enlarged_sum(
         image: the name of the image.
 
     Returns:
-        The enlargement, and the tensors that take the place of the sum and of the enlarged image;
-        None and nothing if the tensor is no such sum.
+        The base, and the tensors that take the place of the sum and of the base; None and nothing
+        if the tensor is no such sum.
     """
     total = graph.sole_writer(result)
     shuffle = None
@@ -130,27 +126,30 @@ def _enlarged_sum(
     if total is None or total.op_type != "Add":
         return None, {}
     for other, name in zip(total.inputs, total.inputs[::-1], strict=True):
-        node = graph.sole_writer(name)
-        if node is None or node.inputs[0] != image:
-            continue
-        enlargement = _resized(graph, node) if shuffle is None else _repeated(graph, node, shuffle)
-        if enlargement is not None:
-            return enlargement, {total.outputs[0]: other, name: image}
+        base = _base(graph, name, image) if shuffle is None else _repeated(graph, name, shuffle)
+        if base is not None:
+            replaced = {total.outputs[0]: other}
+            # The core may read it too.
+            return base, replaced | ({name: image} if graph.sole_writer(name) else {})
     return None, {}
 
 
-def _resized(graph: OnnxGraph, node: Node) -> Enlargement | None:
-    """Return what a Resize of an image does, if the host computes it to the bit at every place."""
-    if node.op_type not in ("Resize", "Upsample"):
-        return None
+def _base(graph: OnnxGraph, name: str, image: str) -> Base | None:
+    """Return the base that a tensor is: channels of the image, or these enlarged in a way that the
+    host computes alike at every place.
+    """
+    node = graph.writers.get(name)
+    if node is None or node.op_type not in ("Resize", "Upsample"):
+        return _channels(graph, name)
+    source = THE_IMAGE if node.inputs[0] == image else _channels(graph, node.inputs[0])
     resizing = Resizing.of(node, graph)
-    if resizing.factors[:2] != (1, 1) or resizing.factors[2] != resizing.factors[3]:
+    if source is None or resizing.factors[:2] != (1, 1):
         return None
     factor = int(resizing.factors[2])
-    if factor != resizing.factors[2] or factor < 2:
+    if resizing.factors[2:] != (factor, factor) or factor < 2:
         return None
     if resizing.mode == "nearest":
-        return Enlargement(factor) if resizing.makes_blocks(factor) else None
+        return replace(source, factor=factor) if resizing.makes_blocks(factor) else None
     # Sums of weights that are multiples of a power of two are rounded alike at every place.
     is_exact = factor & (factor - 1) == 0
     is_plain = node.attributes.get("cubic_coeff_a", CUBIC) == CUBIC
@@ -158,24 +157,44 @@ def _resized(graph: OnnxGraph, node: Node) -> Enlargement | None:
     if resizing.where not in ("half_pixel", "pytorch_half_pixel") or not (is_exact and is_plain):
         return None
     modes: dict[str, Mode] = {"linear": "linear", "cubic": "cubic"}
-    return Enlargement(factor, modes[resizing.mode])
+    return replace(source, factor=factor, mode=modes[resizing.mode])
 
 
-def _repeated(graph: OnnxGraph, node: Node, shuffle: Node) -> Enlargement | None:
-    """Return the enlargement if a convolution copies an image's channels so that a pixel shuffle of
-    the copies repeats the image's pixels.
-    """
-    weight = graph.value(node, 1)
-    bias = graph.value(node, 2)
-    if node.op_type != "Conv" or weight is None or weight.shape[2:] != (1, 1):
+def _channels(graph: OnnxGraph, name: str) -> Base | None:
+    """Return the base if a tensor is what a convolution of one pixel selects of the image."""
+    weight = _copies(graph, name)
+    if weight is None:
         return None
+    numbers = weight.argmax(1)
+    is_selection = np.array_equal(weight, np.eye(weight.shape[1])[numbers])
+    return Base(tuple(numbers.tolist())) if is_selection else None
+
+
+def _repeated(graph: OnnxGraph, name: str, shuffle: Node) -> Base | None:
+    """Return the base if a tensor has the image's channels so that a pixel shuffle repeats the
+    image's pixels.
+    """
+    weight = _copies(graph, name)
     operation = READERS["DepthToSpace"](shuffle, graph)
     assert isinstance(operation, Shuffle)  # noqa: S101 - that is what it reads
-    channels = weight.shape[1]
-    if len(weight) != channels * operation.block**2 or (bias is not None and bias.any()):
+    if weight is None or len(weight) != weight.shape[1] * operation.block**2:
         return None
     # One image for each channel, with a single pixel in that channel.
-    images = np.eye(channels, dtype=np.float32)[:, :, None, None]
-    copies = operation(np.einsum("oiyx,nihw->nohw", weight, images))
-    enlargement = Enlargement(operation.block)
-    return enlargement if np.array_equal(copies, enlargement(images)) else None
+    images = np.eye(weight.shape[1], dtype=np.float32)
+    copies = operation((images @ weight.T)[:, :, None, None])
+    base = Base(factor=operation.block)
+    return base if np.array_equal(copies, base(images[:, :, None, None])) else None
+
+
+def _copies(graph: OnnxGraph, name: str) -> np.ndarray | None:
+    """Return the weights (O, C) if a tensor is a convolution of one pixel of the image, without
+    bias; None for any other tensor.
+    """
+    node = graph.writers.get(name)
+    if node is None or node.op_type != "Conv" or node.inputs[0] not in graph.inputs:
+        return None
+    weight = graph.value(node, 1)
+    is_plain = len(node.inputs) == 2 and node.attributes.get("group", 1) == 1
+    if weight is None or weight.shape[2:] != (1, 1) or not is_plain:
+        return None
+    return weight[:, :, 0, 0]

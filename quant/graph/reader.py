@@ -97,8 +97,8 @@ def read_network(model: onnx.ModelProto) -> SplitNetwork:
             border_px=reader.border_px,
             limits=reader.end.limits,
             activation=reader.end.activation,
-            enlargement=reader.end.enlargement or network.enlargement,
-            adds_image=network.adds_image or reader.end.enlargement is not None,
+            base=reader.end.base or network.base,
+            adds_image=network.adds_image or reader.end.base is not None,
         )
         check_network(network)
     # Last, because what else is refused would be after adapting as well.

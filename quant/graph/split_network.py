@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from beers_deploy.profiles.errors import LONGEST, ModelError, printable
-from beers_deploy.quant.graph.enlargement import UNCHANGED, Enlargement
+from beers_deploy.quant.graph.base import THE_IMAGE, Base
 from beers_deploy.quant.graph.operations import (
     CORRECTION,
     IMAGE,
@@ -61,7 +61,7 @@ class SplitNetwork:
         limits: the low and the high end to which the network clips the result; empty if it does
             not.
         activation: "Sigmoid" or "Tanh" of the result, in front of the add; empty for none.
-        enlargement: how the image is enlarged before it is added.
+        base: what of the image is added.
     """
 
     graph: Graph = field(compare=False)
@@ -73,7 +73,7 @@ class SplitNetwork:
     border_px: int = 0
     limits: tuple[float, ...] = ()
     activation: str = ""
-    enlargement: Enlargement = UNCHANGED
+    base: Base = THE_IMAGE
 
     @property
     def core_channels(self) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper
 
-from beers_deploy.quant.graph.enlargement import Enlargement
+from beers_deploy.quant.graph.base import Base
 from beers_deploy.quant.graph.operations import (
     LEAKY_SLOPE,
     PLANES,
@@ -146,24 +146,29 @@ def _pool(w: GraphWriter, op: MaxPool | AveragePool, feeds: list[str], output: s
     w.node(type(op).__name__, output, feeds, op.name, **counted, **window)
 
 
-def write_enlargement(
-    w: GraphWriter, enlargement: Enlargement, source: str, output: str, name: str = ""
-) -> None:
-    """Write an enlargement of the rows and columns of a tensor.
+def _resize(w: GraphWriter, factor: int, mode: str, source: str, output: str, name: str) -> None:
+    scales = w.constant(f"resize_by_{factor}", np.array([1, 1, factor, factor], np.float32))
+    where = {"coordinate_transformation_mode": "half_pixel"}
+    if mode == "nearest":
+        where = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+    w.node("Resize", output, [source, "", scales], name, mode=mode, **where)
+
+
+def write_base(w: GraphWriter, base: Base, image: str) -> str:
+    """Write the base to which a network adds its result, and return its name.
 
     Args:
         w: the writer that receives the nodes.
-        enlargement: its factor and interpolation.
-        source: the name of the tensor that is read.
-        output: the name of the result.
-        name: the name of the node; empty to use that of the result.
+        base: what of the image is added.
+        image: the name of the image.
     """
-    factor = enlargement.factor
-    scales = w.constant(f"resize_by_{factor}", np.array([1, 1, factor, factor], np.float32))
-    where = {"coordinate_transformation_mode": "half_pixel"}
-    if enlargement.mode == "nearest":
-        where = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
-    w.node("Resize", output, [source, "", scales], name, mode=enlargement.mode, **where)
+    if base.channels:
+        numbers = w.constant("added_channels", np.array(base.channels))
+        image = w.node("Gather", "host_back.channels", [image, numbers], axis=1)
+    if base.factor > 1:
+        _resize(w, base.factor, base.mode, image, "host_back.enlarged", "host_back.enlarge")
+        image = "host_back.enlarged"
+    return image
 
 
 def write_shuffle(w: GraphWriter, op: Shuffle, source: str, output: str, channels: int = 1) -> None:
@@ -199,8 +204,8 @@ _WRITERS: dict[type, Callable[..., None]] = {
     Concat: lambda w, op, feeds, output: w.node("Concat", output, feeds, op.name, axis=1),
     MaxPool: _pool,
     AveragePool: _pool,
-    Resize: lambda w, op, feeds, output: write_enlargement(
-        w, Enlargement(op.factor, "linear" if op.bilinear else "nearest"), feeds[0], output, op.name
+    Resize: lambda w, op, feeds, output: _resize(
+        w, op.factor, "linear" if op.bilinear else "nearest", feeds[0], output, op.name
     ),
     Shuffle: lambda w, op, feeds, output: write_shuffle(w, op, feeds[0], output),
     Pointwise: lambda w, op, feeds, output: _activation(

@@ -1,11 +1,11 @@
 """Store the host's part as JSON in the metadata of an INT8 file, and read it back."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, get_args
 
 from beers_deploy.quant.graph import Shuffle
-from beers_deploy.quant.graph.enlargement import UNCHANGED, Enlargement, Mode
+from beers_deploy.quant.graph.base import THE_IMAGE, Base, Mode
 from beers_deploy.quant.host_part.input_encoding import (
     BANK_SLICES,
     Direct,
@@ -37,8 +37,8 @@ def host_part_to_json(part: HostPart) -> dict[str, Any]:
     for name in ("input_ranges", "limits", "activation"):
         if not record[name]:
             del record[name]
-    if part.enlargement == UNCHANGED:
-        del record["enlargement"]
+    if part.base == THE_IMAGE:
+        del record["base"]
     # A bank has a margin of its own, and files without one are described as they were before.
     if part.encoding != BANK_SLICES and part.encoding.margin_px:
         record["margin_px"] = part.encoding.margin_px
@@ -67,11 +67,12 @@ def host_part_from_json(record: Mapping[str, Any]) -> HostPart:
     ranges = tuple((float(low), float(high)) for low, high in record.get("input_ranges", ()))
     limits = tuple(map(float, record.get("limits", ())))
     require_ranges((*ranges, limits) if limits else ranges)
-    enlargement = Enlargement(**record.get("enlargement", {}))
+    base = Base(**record.get("base", {}))
+    base = replace(base, channels=tuple(map(int, base.channels)))
     activation = record.get("activation", "")
-    is_known = activation in ("", *ACTIVATIONS) and enlargement.mode in get_args(Mode)
-    if not is_known or not 1 <= int(enlargement.factor) <= WINDOW_PX:
-        raise ValueError(f"{enlargement} or {activation!r}, which the host does not compute")
+    is_known = activation in ("", *ACTIVATIONS) and base.mode in get_args(Mode)
+    if not is_known or not 1 <= int(base.factor) <= WINDOW_PX:
+        raise ValueError(f"{base} or {activation!r}, which the host does not compute")
     part = HostPart(
         channels=int(record["channels"]),
         outputs=int(record["outputs"]),
@@ -83,13 +84,15 @@ def host_part_from_json(record: Mapping[str, Any]) -> HostPart:
         input_ranges=ranges,
         limits=limits,
         activation=activation,
-        enlargement=enlargement,
+        base=base,
     )
     # The file is not trusted: its core must read what the host writes, and write what it decodes.
     for key in ("planes", "gains"):
         expected = host_part_to_json(part)[key]
         if record[key] != expected:
             raise ValueError(f"{key} of {record[key]!r} instead of {expected}")
+    if max(base.channels, default=0) >= part.image_channels or min(base.channels, default=0) < 0:
+        raise ValueError(f"channels {base.channels} of {part.image_channels}")
     if len(ranges) not in (0, part.image_channels):
         raise ValueError(f"{len(ranges)} ranges of {part.image_channels} channels")
     return part

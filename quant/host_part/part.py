@@ -21,8 +21,8 @@ from beers_deploy.quant.graph import (
     SplitNetwork,
     channels_of,
 )
-from beers_deploy.quant.graph.enlargement import UNCHANGED, Enlargement
-from beers_deploy.quant.graph.writer import write_enlargement, write_shuffle
+from beers_deploy.quant.graph.base import THE_IMAGE, Base
+from beers_deploy.quant.graph.writer import write_base, write_shuffle
 from beers_deploy.quant.host_part.input_encoding import ENCODED, IMAGE_SLICES, InputEncoding
 from beers_deploy.quant.host_part.output_decoding import DECODED, OutputDecoding, Plain
 from beers_deploy.quant.host_part.writer import ZERO, HostWriter
@@ -55,7 +55,7 @@ class HostPart:
             1].
         limits: low and high end to which a result is clipped; empty for none but the sum above.
         activation: "Sigmoid" or "Tanh" of the decoded result; empty for none.
-        enlargement: how the image is enlarged before it is added.
+        base: what of the image is added.
     """
 
     channels: int = 1
@@ -70,7 +70,7 @@ class HostPart:
     input_ranges: Ranges = ()
     limits: tuple[float, ...] = ()
     activation: str = ""
-    enlargement: Enlargement = UNCHANGED
+    base: Base = THE_IMAGE
 
     @classmethod
     def of(
@@ -98,7 +98,7 @@ class HostPart:
             # An image in [0, 1] is clipped when it is stored.
             limits=network.limits if input_ranges or network.limits != UNIT else (),
             activation=network.activation,
-            enlargement=network.enlargement,
+            base=network.base,
         )
 
     @property
@@ -252,10 +252,6 @@ class HostPart:
         # In float64, so that NumPy and onnxruntime round to the same float32.
         return ACTIVATIONS[self.activation](decoded.astype(np.float64)).astype(np.float32)
 
-    def base(self, image: np.ndarray) -> np.ndarray:
-        """Return an image (N, C, H, W) as it is added to a result: enlarged, if it is."""
-        return self.enlargement(image) if self.enlargement.factor > 1 else image
-
     def clip(self, result: np.ndarray) -> np.ndarray:
         """Clip a result to `clip_limits`, as the host does; return it unchanged if there are no
         limits.
@@ -315,10 +311,7 @@ class HostPart:
         if self.unit != 1:
             result = w.node("Mul", "host_back.in_units", [result, w.scalar("unit", self.unit)])
         if self.adds_image:
-            base = IMAGE
-            if self.enlargement.factor > 1:
-                base = "host_back.enlarged"
-                write_enlargement(w, self.enlargement, IMAGE, base)
+            base = write_base(w, self.base, IMAGE)
             result = w.node("Add", "host_back.add", [base, result])
         name = "host_back.clipped" if self.last else "restored"
         if self.clip_limits:

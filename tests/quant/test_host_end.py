@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose
 
 from beers_deploy.quant.encodings import encoding_faults
 from beers_deploy.quant.graph import IMAGE, read_network, read_planes
-from beers_deploy.quant.graph.enlargement import UNCHANGED, Enlargement, Mode
-from beers_deploy.quant.graph.writer import write_enlargement
+from beers_deploy.quant.graph.base import THE_IMAGE, Base, Mode
+from beers_deploy.quant.graph.writer import write_base
 from beers_deploy.quant.host_part import HostPart, Plain
 from beers_deploy.quant.integer.agreement import agreement
 from beers_deploy.quant.onnx.image_input import image_info
@@ -27,6 +27,8 @@ RANDOM = np.random.default_rng(2)
 CONSTANTS = {
     "into": RANDOM.normal(0, 0.3, (6, 2, 3, 3)),
     "two": RANDOM.normal(0, 0.2, (2, 6, 3, 3)),
+    "into_three": RANDOM.normal(0, 0.3, (6, 3, 3, 3)),
+    "alone": RANDOM.normal(0, 0.2, (1, 6, 3, 3)),
     "eight": RANDOM.normal(0, 0.2, (8, 6, 3, 3)),
     "double": [1.0, 1.0, 2.0, 2.0],
     "half": 0.5,
@@ -45,43 +47,54 @@ BLOCKS = 'coordinate_transformation_mode="asymmetric", nearest_mode="floor"'
 ENDS = {
     "nearest": (
         f"{SHUFFLED} e = Resize<{BLOCKS}>(image, , double) restored = Add(d, e)",
-        ("", Enlargement(2), True),
+        ("", Base((), 2), True),
     ),
     "bilinear, clipped": (
         f"""{PLAIN} d = Resize<{BLOCKS}>(c, , double)
         e = Resize<mode="linear", {HALF_PIXEL}>(image, , double)
         f = Add(e, d) restored = Clip(f, low, high)""",
-        ("", Enlargement(2, "linear"), True),
+        ("", Base((), 2, "linear"), True),
     ),
     "bicubic": (
         f"""{SHUFFLED} e = Resize<mode="cubic", {HALF_PIXEL}>(image, , double)
         restored = Add(d, e)""",
-        ("", Enlargement(2, "cubic"), True),
+        ("", Base((), 2, "cubic"), True),
     ),
     "repeated channels": (
         f"""{FEATURES} c = Conv{PADS}(b, eight)
         x = Slice(image, zero, one, one) y = Slice(image, one, ends, one)
         e = Concat<axis=1>(x, x, x, x, y, y, y, y)
         f = Add(c, e) restored = DepthToSpace<blocksize=2, mode="CRD">(f)""",
-        ("", Enlargement(2), True),
+        ("", Base((), 2), True),
     ),
-    "Sigmoid": (f"{SHUFFLED} restored = Sigmoid(d)", ("Sigmoid", UNCHANGED, False)),
+    "one channel, which the core reads too": (
+        f"""x = Slice(image, one, ends, one) y = Concat<axis=1>(x, image)
+        a = Conv{PADS}(y, into_three) b = Relu(a) c = Conv{PADS}(b, alone)
+        restored = Add(x, c)""",
+        ("", Base((1,)), True),
+    ),
+    "a channel less its noise": (
+        f"""{FEATURES} c = Conv{PADS}(b, alone) x = Slice(image, zero, one, one)
+        restored = Sub(x, c)""",
+        ("", Base((0,)), True),
+    ),
+    "Sigmoid": (f"{SHUFFLED} restored = Sigmoid(d)", ("Sigmoid", THE_IMAGE, False)),
     "Tanh in the range of Sigmoid": (
         f"{PLAIN} d = Tanh(c) e = Add(d, high) restored = Mul(half, e)",
-        ("Sigmoid", UNCHANGED, False),
+        ("Sigmoid", THE_IMAGE, False),
     ),
     "Tanh of the correction": (
         f"{PLAIN} d = Tanh(c) restored = Add(image, d)",
-        ("Tanh", UNCHANGED, True),
+        ("Tanh", THE_IMAGE, True),
     ),
     "Tanh of the correction of the enlarged image": (
         f"""{SHUFFLED} e = Tanh(d) f = Resize<{BLOCKS}>(image, , double)
         restored = Add(f, e)""",
-        ("Tanh", Enlargement(2), True),
+        ("Tanh", Base((), 2), True),
     ),
     "Sigmoid of a sum with the image": (
         f"{PLAIN} d = Add(image, c) restored = Sigmoid(d)",
-        ("Sigmoid", UNCHANGED, False),
+        ("Sigmoid", THE_IMAGE, False),
     ),
 }
 
@@ -101,9 +114,9 @@ def image(height: int, width: int, seed: int = 0) -> np.ndarray:
 @pytest.mark.parametrize("name", ENDS)
 def test_the_host_takes_the_end_and_nothing_changes_in_float(name: str) -> None:
     network = read_network(float_network(name))
-    activation, enlargement, adds_image = ENDS[name][1]
+    activation, base, adds_image = ENDS[name][1]
     assert network.activation == activation
-    assert network.enlargement == enlargement
+    assert network.base == base
     assert network.adds_image == adds_image
     part = HostPart.of(network, Plain())
     raw = image(9, 14)
@@ -134,16 +147,16 @@ def test_int8_files_end_as_the_host_part_does(name: str) -> None:
     ("mode", "factor"),
     [("nearest", 3), *product(("linear", "cubic"), (2, 4))],
 )
-def test_enlargement_equals_torch_and_the_runtime(mode: Mode, factor: int) -> None:
+def test_an_enlarged_base_equals_torch_and_the_runtime(mode: Mode, factor: int) -> None:
     raw = image(7, 11)
     names = {"nearest": "nearest", "linear": "bilinear", "cubic": "bicubic"}
     expected = torch.nn.functional.interpolate(
         torch.from_numpy(raw), scale_factor=factor, mode=names[mode]
     )
-    enlargement = Enlargement(factor, mode)
-    assert_allclose(enlargement(raw), expected.numpy(), atol=1e-6)
+    base = Base((), factor, mode)
+    assert_allclose(base(raw), expected.numpy(), atol=1e-6)
     writer = GraphWriter()
-    write_enlargement(writer, enlargement, IMAGE, "restored")
+    writer.node("Identity", "restored", [write_base(writer, base, IMAGE)])
     result = onnx.helper.make_tensor_value_info("restored", onnx.TensorProto.FLOAT, None)
     model = make_model(writer.graph("g", [image_info(IMAGE, 2, None)], [result]), {})
     assert_allclose(result_of(open_session(model), raw), expected.numpy(), atol=1e-6)

@@ -63,7 +63,8 @@ def test_a_description_states_the_whole_host_part(part: HostPart) -> None:
         {"planes": None},
         {"gains": 0},
         {"activation": "Exp"},
-        {"enlargement": {"factor": 0}},
+        {"base": {"factor": 0}},
+        {"base": {"channels": [1]}},
     ],
 )
 def test_a_damaged_description_is_refused(damage: dict[str, Any]) -> None:

@@ -1,6 +1,7 @@
-"""Enlarge the image to which a network for super-resolution adds its result.
+"""Make the base to which a network adds its result: the image, some of its channels, enlarged.
 
-The host does it in float, as ONNX's Resize and torch's `interpolate` do.
+Networks that read a map of the noise level or several frames add to some channels, those for
+super-resolution to the enlarged image. The host does it in float, as ONNX's Resize does.
 """
 
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 Mode = Literal["nearest", "linear", "cubic"]
-"""The interpolation of an enlargement, in ONNX's words."""
+"""The interpolation of an enlarged image, in ONNX's words."""
 REACH_PX = 2
 """The number of pixels around a pixel's own that an enlargement reads at most."""
 CUBIC = -0.75
@@ -17,14 +18,16 @@ CUBIC = -0.75
 
 
 @dataclass(frozen=True)
-class Enlargement:
-    """The enlargement of the image, to which a network adds its result.
+class Base:
+    """The base that is made of an image.
 
     Attributes:
+        channels: the numbers of the image's channels that the base has; empty for all.
         factor: the factor of rows and columns; 1 leaves the image as it is.
         mode: the interpolation, with half-pixel centres and repeated borders.
     """
 
+    channels: tuple[int, ...] = ()
     factor: int = 1
     mode: Mode = "nearest"
 
@@ -45,7 +48,11 @@ class Enlargement:
         return np.where(distances <= 1, near, np.where(distances < 2, far, 0)).astype(np.float32)
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Return an image (N, C, H, W) enlarged to (N, C, factor H, factor W)."""
+        """Return the base (N, C', factor H, factor W) of an image (N, C, H, W)."""
+        if self.channels:
+            image = image[:, list(self.channels)]
+        if self.factor == 1:
+            return image
         for _ in range(2):
             # Once along the rows, once along the columns.
             count, channels, height, width = image.shape
@@ -59,5 +66,5 @@ class Enlargement:
         return image
 
 
-UNCHANGED = Enlargement()
-"""The enlargement that leaves an image as it is."""
+THE_IMAGE = Base()
+"""The base that is the image itself."""
