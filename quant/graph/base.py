@@ -45,7 +45,8 @@ class Base:
         # R. Keys, "Cubic convolution interpolation for digital image processing", IEEE TASSP 1981.
         near = (CUBIC + 2) * distances**3 - (CUBIC + 3) * distances**2 + 1
         far = CUBIC * (distances**3 - 5 * distances**2 + 8 * distances - 4)
-        return np.where(distances <= 1, near, np.where(distances < 2, far, 0)).astype(np.float32)
+        weights = np.where(distances <= 1, near, np.where(distances < 2, far, 0))
+        return np.asarray(weights, np.float32)
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Return the base (N, C', factor H, factor W) of an image (N, C, H, W)."""
