@@ -63,8 +63,13 @@ def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
     Args:
         model: a network; not changed.
     """
-    if fixed_tile_px(model) is None:
-        return model
+    return model if fixed_tile_px(model) is None else without_size(model)
+
+
+def without_size(model: onnx.ModelProto) -> onnx.ModelProto:
+    """Return a network without the sizes that its file states, as `any_size` does, also if its
+    image is no square.
+    """
     copy = deepcopy(model)
     for value in (*copy.graph.input, *copy.graph.output):
         dims = value.type.tensor_type.shape.dim

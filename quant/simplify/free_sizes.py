@@ -9,6 +9,7 @@ them.
 3. Do both for two sizes. If the networks are equal, the size has no effect, and theirs is the
    network of every image whose sides are multiples of `MULTIPLE_PX`. Otherwise the network is not
    changed.
+4. Free a fixed height and width that differ, which no tile has, if they have no effect.
 
 Exporters write such arithmetic for a U-Net that pads or enlarges to the size of its skips, for
 `chunk`, and for a number that is repeated over the image.
@@ -22,6 +23,7 @@ import onnx
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
+from beers_deploy.quant.onnx.image_input import without_size
 from beers_deploy.quant.simplify.rearrangements import (
     OF_BLOCKS,
     RESHAPING,
@@ -36,8 +38,31 @@ SIZES_PX = (2 * MULTIPLE_PX, 3 * MULTIPLE_PX), (4 * MULTIPLE_PX, 3 * MULTIPLE_PX
 """Rows and columns differ, so that a network that confuses them is detected."""
 SIZED = {"Concat", "Expand", "Pad", "Resize", "Shape", "Size", "Slice"}
 """Operators that may need the size of an image."""
+LOCAL = {
+    *("Add", "AveragePool", "Clip", "Concat", "Conv", "ConvTranspose", "DepthToSpace", "Div"),
+    *("HardSigmoid", "HardSwish", "LeakyRelu", "MaxPool", "Mul", "Pad", "PRelu", "Relu", "Resize"),
+    *("Sigmoid", "SpaceToDepth", "Sub", "Tanh"),
+}
+"""Operators that do the same at every pixel, for images of all sizes."""
 Fold = Callable[[onnx.ModelProto], onnx.ModelProto]
 """A function that folds constants, as onnxruntime does."""
+
+
+def free_rectangle(model: onnx.ModelProto) -> onnx.ModelProto:
+    """Return the network for images of any size if it is fixed to a height and another width, and
+    they have no effect (point 4 of the module); otherwise `model` itself.
+
+    Args:
+        model: a simplified float network; not changed.
+    """
+    graph = OnnxGraph(model)
+    sizes = next(iter(graph.inputs.values()), [])
+    is_rectangle = len(sizes) == 4 and all(sizes[2:]) and sizes[2] != sizes[3]
+    is_local = all(
+        node.op_type in LOCAL and (node.op_type != "Resize" or graph.numbers(node, 2, "scales"))
+        for node in graph.nodes
+    )
+    return without_size(model) if is_rectangle and is_local else model
 
 
 def free_sizes(model: onnx.ModelProto, fold: Fold) -> onnx.ModelProto:

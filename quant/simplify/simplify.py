@@ -57,7 +57,7 @@ from beers_deploy.quant.simplify.fold_affine import (
     fold_behind,
     fold_in_front,
 )
-from beers_deploy.quant.simplify.free_sizes import free_sizes
+from beers_deploy.quant.simplify.free_sizes import free_rectangle, free_sizes
 from beers_deploy.quant.simplify.fully_connected import ConnectByConvolutions
 from beers_deploy.quant.simplify.grouped_convolutions import without_groups
 from beers_deploy.quant.simplify.image_residual import add_to_image, clip_last
@@ -130,7 +130,8 @@ def simplify(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     """
     with contradictions(where):
         network = model if _is_plain(model) else _simplified(model, where)
-        return with_missing_border(behind_convolutions(activations_first(network)))
+        network = free_rectangle(behind_convolutions(activations_first(network)))
+        return with_missing_border(network)
 
 
 def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:

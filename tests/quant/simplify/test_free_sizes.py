@@ -17,6 +17,7 @@ from torch.nn import functional
 from beers_deploy.quant.graph import refusal
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.simplify import simplify
+from tests.quant.simplify.networks import network_from
 
 FEATURES = 4
 
@@ -250,3 +251,22 @@ def test_arithmetic_that_depends_on_the_size_stays_and_is_refused() -> None:
     model = simplify(exported(Cropped()), "a.onnx")
     assert any(node.op_type == "Shape" for node in model.graph.node)
     assert "Export it with fixed height and width" in refusal(model)
+
+
+@pytest.mark.parametrize(
+    ("nodes", "is_freed"),
+    [
+        ('c = Conv<pads=[1,1,1,1]>(x, w) r = Resize<mode="linear">(c, , twice) y = Tanh(r)', True),
+        ("c = Conv<pads=[1,1,1,1]>(x, w) g = GlobalAveragePool(c) y = Mul(c, g)", False),
+    ],
+)
+def test_a_rectangle_is_freed_where_it_has_no_effect(nodes: str, is_freed: bool) -> None:
+    """The free network gives the results of the rectangle, and results of other sizes."""
+    model = network_from(nodes, ends="float[1,4,8,12] x => float[1,4,H,W] y")
+    freed = simplify(model, "a.onnx")
+    assert (freed.graph.input[0].type.tensor_type.shape.dim[2].dim_value == 0) is is_freed
+    image = np.random.default_rng(0).random((1, 4, 8, 12), dtype=np.float32)
+    results = [result_of(open_session(each), image) for each in (model, freed)]
+    np.testing.assert_array_equal(*results)
+    if is_freed:
+        assert result_of(open_session(freed), image[..., :9]).shape[2:] == (16, 18)
