@@ -219,6 +219,8 @@ def tensor_values(
     Yields:
         For each tile the tensors (1, C, h, w) in the order of `names`.
     """
+    # Tensors around a mirrored border are larger than the image.
+    halo_px = None if host_part.border_px else halo_px
     for (top, bottom), (left, right) in _places(image, halo_px):
         around_px = halo_px or 0
         above = min(top, around_px)

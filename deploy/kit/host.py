@@ -142,6 +142,8 @@ def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
     if S["activation"]:
         value = ACTIVATIONS[S["activation"]](value.astype(np.float64)).astype(F)
     value = shuffled(value, S["back"], up=True) * F(unit)
+    if S["crop_px"]:
+        value = value[:, :, S["crop_px"] : -S["crop_px"], S["crop_px"] : -S["crop_px"]]
     if S["adds_image"]:
         value = base(image) + value
     if S["limits"]:

@@ -123,6 +123,7 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
         "border_px": part.border_px,
         "input_factors": [1.0] if part.full_scale is None else (1 / part.full_scale).tolist(),
         "activation": part.activation,
+        "crop_px": part.crop_px,
         "adds_image": part.adds_image,
         "added_channels": part.base.channels or list(range(part.image_channels)),
         "enlargement": part.base.weights.tolist(),

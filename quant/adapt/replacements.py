@@ -17,6 +17,8 @@ And by another function again:
 
 6. Spatial attention that shrinks and enlarges by no whole factors is aligned with its map
    (`quant.graph.attention`).
+7. Maps that are padded by reflection or by their edge are padded by zeros. The host mirrors the
+   image beyond its borders and crops the result, so that the zeros lie outside of it.
 
 Mish, Tanh, ELU and Softplus stay: no function of the DPU is near enough to be fitted.
 """
@@ -28,6 +30,7 @@ from enum import StrEnum
 import numpy as np
 import onnx
 
+from beers_deploy.quant.adapt.zero_padding import pad_by_zeros, pads_of
 from beers_deploy.quant.graph.attention import aligned, shrinking
 from beers_deploy.quant.graph.host_end import host_end
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
@@ -54,6 +57,7 @@ class Kind(StrEnum):
     leaky_relu = "LeakyReLU of another slope"
     prelu = "PReLU"
     attention = "spatial attention (ESA)"
+    padding = "reflecting padding"
 
 
 APPROXIMATIONS = {
@@ -62,8 +66,9 @@ APPROXIMATIONS = {
     Kind.leaky_relu: "LeakyReLU of 26/256",
     Kind.prelu: "LeakyReLU of 26/256",
     Kind.attention: "attention on an eighth of the sides",
+    Kind.padding: "zeros around the mirrored image",
 }
-"""The other function that replaces each kind (1 to 3 and 6)."""
+"""The other function that replaces each kind (1 to 3, 6 and 7)."""
 EXACT = {
     Kind.hard_sigmoid: "HardSigmoid of a scaled input",
     Kind.leaky_relu: "ReLU in a second branch, and an Add",
@@ -87,6 +92,8 @@ def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
         return Kind.attention
     if silu_input(graph, node):
         return Kind.silu
+    if pads_of(graph, node):
+        return Kind.padding
     if node.op_type == "Sigmoid":
         (result,) = node.outputs
         readers = graph.readers[result]
@@ -176,6 +183,9 @@ def nodes_by_kind(graph: OnnxGraph) -> dict[Kind, list[Node]]:
         kind = kind_of(graph, node)
         if kind is not None and node.outputs[0] not in on_host:
             nodes.setdefault(kind, []).append(node)
+    # The host mirrors the image itself.
+    if all(node.inputs[0] in graph.inputs for node in nodes.get(Kind.padding, [])):
+        nodes.pop(Kind.padding, None)
     return nodes
 
 
@@ -202,7 +212,7 @@ def replaced(
         if kind is Kind.attention and kind in approximated:
             for node in nodes:
                 plan |= aligned(graph, node)
-        elif kind in approximated:
+        elif kind in approximated and kind is not Kind.padding:
             plan |= {node: [_approximation(graph, node, kind)] for node in nodes}
         elif kind in exact and kind is Kind.hard_sigmoid:
             plan |= {node: _scaled_hard_sigmoid(graph, node) for node in nodes}
@@ -213,7 +223,10 @@ def replaced(
     graph.save()
     fold_in_front(graph, float_shapes(graph))
     graph.save()
-    return activations_first(network)
+    network = activations_first(network)
+    if Kind.padding in approximated:
+        pad_by_zeros(network)
+    return network
 
 
 def _approximation(graph: OnnxGraph, node: Node, kind: Kind) -> Node:

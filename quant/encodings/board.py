@@ -72,7 +72,7 @@ def _core_file(
     size = image_info(PLANES, host_part.planes, read_px)
     written = host_part.decoding.copies * host_part.outputs
     factor = host_part.base.factor
-    written_px = tile_px and tile_px * factor // host_part.correction_px
+    written_px = tile_px and (tile_px * factor + 2 * host_part.crop_px) // host_part.correction_px
     result = image_info(CORRECTION, written, written_px)
     # A result that the image itself is not added to may have another size.
     if factor > 1 or not host_part.adds_image:

@@ -1,8 +1,9 @@
 """Find what the host computes at the end of a float network, behind the core's result.
 
-    core -> Sigmoid or Tanh -> + base -> Clip
+    core -> Sigmoid or Tanh -> + base -> Clip -> crop
 
-1. Clips to constant limits, which come last.
+1. A crop by as many pixels as the image was mirrored beyond its borders, and clips to constant
+   limits.
 2. The sum with a base: some channels of the image, or the enlarged image. A sum in front of a pixel
    shuffle, with channels that repeat the image's, is one with the image whose pixels are repeated.
 3. A Sigmoid or a Tanh behind that; or one to whose result the image itself is added.
@@ -31,6 +32,7 @@ class HostEnd:
     Attributes:
         replaced: for the result of each node that the host computes, the tensor that takes its
             place in the core.
+        crop_px: the number of pixels of the result that are cut off at each side.
         limits: low and high end to which the network clips its result; empty if it does not.
         base: what the network adds its result to; None for nothing, or the image itself.
         activation: "Sigmoid" or "Tanh"; empty if there is none.
@@ -39,6 +41,7 @@ class HostEnd:
     """
 
     replaced: dict[str, str]
+    crop_px: int = 0
     limits: tuple[float, ...] = ()
     base: Base | None = None
     activation: str = ""
@@ -61,6 +64,10 @@ def host_end(graph: OnnxGraph) -> HostEnd:
     (result, *_) = graph.outputs
     replaced: dict[str, str] = {}
     # 1.
+    crop_px = _crop_px(graph, result)
+    if crop_px:
+        replaced[result] = graph.writers[result].inputs[0]
+        result = replaced[result]
     limits: tuple[float, ...] = ()
     while ends := _limits(graph, result, limits):
         limits = ends
@@ -81,10 +88,20 @@ def host_end(graph: OnnxGraph) -> HostEnd:
         or activation.op_type not in ACTIVATIONS
         or activation.inputs[0] in graph.inputs
     ):
-        return HostEnd(replaced, limits, base, "", base is not None)
+        return HostEnd(replaced, crop_px, limits, base, "", base is not None)
     replaced[activation.outputs[0]] = activation.inputs[0]
     is_last = base is not None or not adds_image
-    return HostEnd(replaced, limits, base, activation.op_type, is_last)
+    return HostEnd(replaced, crop_px, limits, base, activation.op_type, is_last)
+
+
+def _crop_px(graph: OnnxGraph, result: str) -> int:
+    """Return the pixels that a Slice cuts off at each side of a tensor; 0 for another node."""
+    node = graph.sole_writer(result)
+    if node is None or node.op_type != "Slice":
+        return 0
+    starts, stops, axes = (graph.numbers(node, place, "") for place in (1, 2, 3))
+    is_crop = starts and axes == [2, 3] and starts == [starts[0]] * 2
+    return int(starts[0]) if is_crop and stops == [-starts[0]] * 2 else 0
 
 
 def _limits(graph: OnnxGraph, result: str, limits: tuple[float, ...]) -> tuple[float, ...]:

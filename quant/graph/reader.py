@@ -72,8 +72,8 @@ REMEDIES = {
     **dict.fromkeys(("PRelu", "Sigmoid", "Gelu", "Erf"), ADAPT),
     **dict.fromkeys(("ConstantOfShape", "Expand", "Shape", "Size", "Tile"), OF_ONE_SIZE),
     "Pad": (
-        "Pad in the convolution; a network behind a bank is quantised from its weights "
-        "(.safetensors)."
+        "Pad by zeros in the convolution; 'quantize --adapt' (adapt=True) replaces reflecting "
+        "padding in front of convolutions, and measures the cost."
     ),
 }
 """Advice for each operator that no DPU computes."""
@@ -95,6 +95,7 @@ def read_network(model: onnx.ModelProto) -> SplitNetwork:
         network = replace(
             network,
             border_px=reader.border_px,
+            crop_px=reader.end.crop_px,
             limits=reader.end.limits,
             activation=reader.end.activation,
             base=reader.end.base or network.base,
@@ -154,9 +155,10 @@ class _Reader:
         The host also adds the image to the result, so the sum may read the image without the Pad.
         """
         source = self.source
-        pads = [node for node in source.readers[self.image] if node.op_type == "Pad"]
+        pads = [node for node in source.nodes if node.op_type == "Pad"]
         others = [node.op_type for node in source.readers[self.image] if node not in pads]
-        if len(pads) != 1 or set(others) - {"Add"} or pads[0].attributes.get("mode") != "reflect":
+        is_mirror = len(pads) == 1 and pads[0].inputs[0] == self.image and not set(others) - {"Add"}
+        if not is_mirror or pads[0].attributes.get("mode") != "reflect":
             return 0
         amounts = source.numbers(pads[0], 1, "pads") or [0]
         border_px = int(amounts[-1])
@@ -204,7 +206,7 @@ class _Reader:
                 FIX_SIZE,
             )
         if not (rows and columns):
-            check_result_size(graph, self.border_px)
+            check_result_size(graph, self.border_px, self.end.crop_px)
         return sized(graph, (rows, columns)) if pools else graph
 
     def _check_whole(self) -> None:
@@ -222,6 +224,8 @@ class _Reader:
             )
         for node in self.source.nodes:
             if REMEDIES.get(node.op_type) in (NORMALISES, STATISTICS):
+                raise _refused(node, self.source)
+            if node.op_type == "Pad":
                 raise _refused(node, self.source)
             if node.op_type == "Resize" and node.outputs[0] not in self.end.replaced:
                 READERS[node.op_type](node, self.source)

@@ -58,6 +58,7 @@ class SplitNetwork:
         last: pixel shuffles after the image was added. If the image has one channel and the sum
             several, it is added to each of them.
         border_px: the number of pixels by which the network mirrors the image beyond its borders.
+        crop_px: the number of pixels of the result that the network cuts off at each side.
         limits: the low and the high end to which the network clips the result; empty if it does
             not.
         activation: "Sigmoid" or "Tanh" of the result, in front of the add; empty for none.
@@ -71,6 +72,7 @@ class SplitNetwork:
     adds_image: bool = True
     last: tuple[Shuffle, ...] = ()
     border_px: int = 0
+    crop_px: int = 0
     limits: tuple[float, ...] = ()
     activation: str = ""
     base: Base = THE_IMAGE
@@ -311,7 +313,7 @@ WHOLE_PX = 64 * 3 * 5 * 7
 """A side that the factors of all practical networks divide without a remainder."""
 
 
-def check_result_size(graph: Graph, border_px: int) -> None:
+def check_result_size(graph: Graph, border_px: int, crop_px: int) -> None:
     """Raise ModelError unless the result's size is a fixed multiple or fraction of the image's
     size.
 
@@ -320,12 +322,13 @@ def check_result_size(graph: Graph, border_px: int) -> None:
     Args:
         graph: the operations from `IMAGE` to `CORRECTION`, for any size of image.
         border_px: the number of pixels by which the network mirrors the image beyond its borders.
+        crop_px: the number of pixels of the result that it cuts off at each side.
     """
     once, twice = (
         _sizes(graph, (side_px + 2 * border_px,) * 2)[CORRECTION]
         for side_px in (WHOLE_PX, 2 * WHOLE_PX)
     )
-    extra = [2 * one - two for one, two in zip(once, twice, strict=True)]
+    extra = [2 * one - two - 2 * crop_px for one, two in zip(once, twice, strict=True)]
     if any(extra):
         raise unsupported(
             f"The network's result is not its image's size or a multiple of it: {extra[0]:+d} "

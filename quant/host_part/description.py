@@ -34,7 +34,7 @@ def host_part_to_json(part: HostPart) -> dict[str, Any]:
     # Encoding and decoding are described by the flags that the first files had.
     del record["encoding"], record["decoding"]
     # What few networks have is described only for these.
-    for name in ("input_ranges", "limits", "activation"):
+    for name in ("input_ranges", "limits", "activation", "crop_px"):
         if not record[name]:
             del record[name]
     if part.base == THE_IMAGE:
@@ -71,6 +71,7 @@ def host_part_from_json(record: Mapping[str, Any]) -> HostPart:
     base = replace(base, channels=tuple(map(int, base.channels)))
     activation = record.get("activation", "")
     is_known = activation in ("", *ACTIVATIONS) and base.mode in get_args(Mode)
+    is_known = is_known and 0 <= int(record.get("crop_px", 0)) <= MOST_MARGIN_PX * WINDOW_PX
     if not is_known or not 1 <= int(base.factor) <= WINDOW_PX:
         raise ValueError(f"{base} or {activation!r}, which the host does not compute")
     part = HostPart(
@@ -83,6 +84,7 @@ def host_part_from_json(record: Mapping[str, Any]) -> HostPart:
         decoding=_decoding(record),
         input_ranges=ranges,
         limits=limits,
+        crop_px=int(record.get("crop_px", 0)),
         activation=activation,
         base=base,
     )

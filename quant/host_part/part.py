@@ -54,6 +54,8 @@ class HostPart:
         input_ranges: the range (low, high) of each channel of the image; empty if all are in [0,
             1].
         limits: low and high end to which a result is clipped; empty for none but the sum above.
+        crop_px: the number of pixels that are cut off at each side of the result, before the image
+            is added. The core computes them for the mirrored border.
         activation: "Sigmoid" or "Tanh" of the decoded result; empty for none.
         base: what of the image is added.
     """
@@ -69,6 +71,7 @@ class HostPart:
     decoding: OutputDecoding = field(default_factory=Plain)
     input_ranges: Ranges = ()
     limits: tuple[float, ...] = ()
+    crop_px: int = 0
     activation: str = ""
     base: Base = THE_IMAGE
 
@@ -97,6 +100,7 @@ class HostPart:
             input_ranges=input_ranges,
             # An image in [0, 1] is clipped when it is stored.
             limits=network.limits if input_ranges or network.limits != UNIT else (),
+            crop_px=network.crop_px,
             activation=network.activation,
             base=network.base,
         )
@@ -208,8 +212,8 @@ class HostPart:
         return self.finish(image, self.decode(result, scale))
 
     def finish(self, image: np.ndarray, decoded: np.ndarray) -> np.ndarray:
-        """Compute the restored image from an image and a decoded result: activate, shuffle, add the
-        image, and clip.
+        """Compute the restored image from an image and a decoded result: activate, shuffle, crop,
+        add the image, and clip.
 
         Args:
             image: (N, C, H, W) in the network's units.
@@ -221,6 +225,8 @@ class HostPart:
         result = self.activated(decoded)
         for shuffle in self.back:
             result = shuffle(result)
+        if self.crop_px:
+            result = result[..., self.crop_px : -self.crop_px, self.crop_px : -self.crop_px]
         result = self.clip(self.base(image) + result if self.adds_image else result)
         for shuffle in self.last:
             result = shuffle(result)
@@ -241,6 +247,8 @@ class HostPart:
         for shuffle in reversed(self.last):
             result = shuffle.inverse(result)
         result = result - self.base(image) if self.adds_image else result
+        # Fine-tuning judges no pixels at the border.
+        result = np.pad(result, [(0, 0), (0, 0), *[(self.crop_px,) * 2] * 2], "edge")
         for shuffle in reversed(self.back):
             result = shuffle.inverse(result)
         return np.ascontiguousarray(result)
@@ -310,6 +318,10 @@ class HostPart:
             result = f"host_back.shuffled_{k}"
         if self.unit != 1:
             result = w.node("Mul", "host_back.in_units", [result, w.scalar("unit", self.unit)])
+        if self.crop_px:
+            ends = [self.crop_px] * 2, [-self.crop_px] * 2, [2, 3]
+            places = [w.constant(f"crop_{k}", np.array(end)) for k, end in enumerate(ends)]
+            result = w.node("Slice", "host_back.cropped", [result, *places])
         if self.adds_image:
             base = write_base(w, self.base, IMAGE)
             result = w.node("Add", "host_back.add", [base, result])

@@ -31,7 +31,9 @@ def convolve_slice(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] |
     """
     size = shapes.get(node.inputs[0], ()) if node.op_type == "Slice" else ()
     cuts = slices_of(graph, node) if len(size) == 4 and size[1] else {}
-    if not cuts or not cuts.keys() <= {2, 3}:
+    is_end = node.outputs[0] in graph.outputs and cuts.get(2) == cuts.get(3)
+    # The host crops the result of a network, also where it mirrored the image before.
+    if not cuts or not cuts.keys() <= {2, 3} or is_end:
         return None
     # For rows and columns.
     taps = [[1], [1]]

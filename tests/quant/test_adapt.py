@@ -28,7 +28,8 @@ from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.simplify import simplify
 from beers_deploy.quant.structure import structure_checks
-from tests.quant.quick import change, changed, image, one_guess, quickly
+from tests.quant.quick import change, changed, image, one_guess, patches_of, quickly
+from tests.quant.tiling.small_networks import check_tiles
 
 FEATURES = 6
 IMAGE_WEIGHTS = (FEATURES, 1, 3, 3)
@@ -528,3 +529,35 @@ def test_few_results_do_not_fit_weights(unknowns: int, groups: int) -> None:
         expected = truth.reshape(-1, unknowns) if is_fitted else np.zeros_like(change)
         np.testing.assert_allclose(change, expected, atol=1e-3)
         np.testing.assert_allclose(bias, 3 if is_fitted else errors.mean(0), atol=1e-3)
+
+
+@pytest.mark.parametrize("mode", ["edge", "reflect"])
+def test_zeros_around_the_mirrored_image_change_the_border_alone(mode: str) -> None:
+    writer = GraphWriter()
+    source = "image"
+    around = writer.constant("around", np.array([0, 0, 1, 1] * 2))
+    for k, shape in enumerate([IMAGE_WEIGHTS, (FEATURES, FEATURES, 3, 3), RESULT_WEIGHTS]):
+        padded = writer.node("Pad", f"p{k}", [source, around], mode=mode)
+        weight = np.random.default_rng(k).normal(0, 0.2, shape).astype(np.float32)
+        source = writer.node("Conv", f"c{k}", [padded, writer.constant(f"w{k}", weight)])
+        source = writer.node("Relu", f"r{k}", [source]) if k < 2 else source
+    writer.node("Add", "restored", ["image", source])
+    ends = [image_info(name, 1, None) for name in ("image", "restored")]
+    original = make_model(writer.graph("g", ends[:1], ends[1:]), {})
+    with pytest.raises(ModelError, match="--adapt"):
+        read_network(original)
+    images = [image(48, 64, seed) for seed in range(4)]
+    held_out = patches_of(images)
+    adapted = adapt(original, held_out, held_out)
+    assert list(adapted.rows[0].text.values()) == [
+        "zeros around the mirrored image, not compensated: no fit is nearer"
+    ]
+    expected, actual = (
+        result_of(open_session(model), images[0]) for model in (original, adapted.model)
+    )
+    assert actual.shape == expected.shape
+    np.testing.assert_allclose(actual[..., 3:-3, 3:-3], expected[..., 3:-3, 3:-3], atol=1e-6)
+    int8 = quickly(adapted.model, held_out)
+    restored = result_of(open_session(int8.host), images[0])
+    assert np.abs(restored - actual).mean() < 0.02
+    check_tiles(int8.host, images[0], (24, 32))

@@ -67,8 +67,8 @@ def behind_fitted_kernels() -> bd.Network:
 
 
 def with_host_end() -> bd.Network:
-    """Return a network to whose Tanh the host adds the enlarged image."""
-    network = float_network("Tanh of the correction of the enlarged image")
+    """Return a network whose result the host crops and adds to the enlarged image."""
+    network = float_network("Tanh, enlarged image, and a crop of the mirrored border")
     raw = np.random.default_rng(0).random((1, 2, 40, 40), dtype=np.float32)
     return bd.Network.load(quickly(network, patches_of([raw])).host)
 

@@ -1,0 +1,82 @@
+"""Pad maps by zeros where a network pads them by reflection or by their edge.
+
+1. Each convolution pads by zeros what the Pad in front of it added.
+2. A Pad mirrors the image beyond its borders, and a Slice crops the result by as much. The host
+   computes both. Zeros then lie outside of the image, so that little of it changes.
+"""
+
+import numpy as np
+import onnx
+
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.tiling.receptive_field import tiling_of
+
+MIRRORED_PX = 16
+"""The number of pixels by which the image is mirrored, or more where strides need a multiple."""
+
+
+def pads_of(graph: OnnxGraph, node: Node) -> tuple[int, ...]:
+    """Return top, left, bottom and right of a Pad by reflection or edge that only convolutions
+    read; empty for any other node.
+
+    Args:
+        graph: the graph that the node belongs to.
+        node: any node.
+    """
+    if node.op_type != "Pad" or node.attributes.get("mode") not in ("edge", "reflect"):
+        return ()
+    readers = {reader.op_type for reader in graph.readers[node.outputs[0]]}
+    amounts = graph.numbers(node, 1, "pads") or []
+    is_of_pixels = len(amounts) == 8 and not any((*amounts[:2], *amounts[4:6]))
+    if readers != {"Conv"} or not is_of_pixels or min(amounts) < 0:
+        return ()
+    return (*amounts[2:4], *amounts[6:])
+
+
+def pad_by_zeros(model: onnx.ModelProto) -> None:
+    """Replace reflecting padding in a float network, in place.
+
+    Args:
+        model: a simplified float network whose result has the size of its image, or a multiple.
+
+    Raises:
+        ModelError: the network cannot be tiled.
+    """
+    graph = OnnxGraph(model)
+    # 1.
+    graph.rewrite(_padded)
+    graph.save()
+    # 2.
+    tiling = tiling_of(model)
+    border_px = -(-MIRRORED_PX // tiling.alignment_px) * tiling.alignment_px
+    crop_px = int(border_px * tiling.scale)
+    (image,) = graph.inputs
+    (result,) = graph.outputs
+    mirrored = f"{image}.mirrored"
+    whole = f"{result}.whole"
+    for node in graph.nodes:
+        node.inputs = tuple(mirrored if name == image else name for name in node.inputs)
+    graph.rename(result, whole)
+
+    def constant(name: str, numbers: list[int]) -> str:
+        return graph.add_constant(name, np.array(numbers), np.int64)
+
+    pads_name = constant(f"{mirrored}.pads", [0, 0, border_px, border_px] * 2)
+    ends = [[crop_px] * 2, [-crop_px] * 2, [2, 3]]
+    places = [constant(f"{whole}.{k}", numbers) for k, numbers in enumerate(ends)]
+    pad = Node.new("Pad", [image, pads_name], mirrored, mirrored, mode="reflect")
+    crop = Node.new("Slice", [whole, *places], result, f"{result}.cropped")
+    graph.set_nodes([pad, *graph.nodes, crop])
+    graph.save()
+
+
+def _padded(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Return a convolution that pads by zeros what the Pad in front of it adds; None for others."""
+    pad = graph.writers.get(node.inputs[0]) if node.op_type == "Conv" else None
+    pads = pads_of(graph, pad) if pad is not None else ()
+    if pad is None or not pads:
+        return None
+    own = node.attributes.get("pads", [0] * 4)
+    attributes = {**node.attributes, "pads": [sum(both) for both in zip(own, pads, strict=True)]}
+    inputs = [pad.inputs[0], *node.inputs[1:]]
+    return [Node.new("Conv", inputs, node.outputs[0], node.name, **attributes)]
