@@ -254,10 +254,10 @@ def count_relus(model: onnx.ModelProto) -> Relus:
 
 def _bent_by_relu(model: onnx.ModelProto, core: IntCore | None) -> int:
     """Return the number of LeakyReLUs and PReLUs that the integers compute by a ReLU in a second
-    branch.
+    branch, and of Tanhs that they compute by a ReLU6.
 
-    `quant.adapt` replaces them so. They are counted as the LeakyReLUs and PReLUs of the float
-    network less the LeakyReLUs of the integers.
+    `quant.adapt` replaces them so. They are counted as those of the float network, less the
+    LeakyReLUs of the integers and the Tanh of the host.
 
     Args:
         model: the float network.
@@ -265,11 +265,12 @@ def _bent_by_relu(model: onnx.ModelProto, core: IntCore | None) -> int:
     """
     if core is None:
         return 0
-    slopes = sum(node.op_type in ("LeakyRelu", "PRelu") for node in model.graph.node)
-    return slopes - sum(
+    bent = sum(node.op_type in ("LeakyRelu", "PRelu", "Tanh") for node in model.graph.node)
+    left = sum(
         isinstance(op, IntConv | Pointwise) and op.activation is Activation.leaky_relu
         for op in core.ops
     )
+    return bent - left - (core.host_part.activation == "Tanh")
 
 
 def _is_relu(node: Node, graph: OnnxGraph, tensors: dict[str, Rounded]) -> bool:

@@ -112,10 +112,12 @@ def compensated(
     model = deepcopy(adapted)
     networks = Networks(original, model, OnnxGraph(model), images)
     originals = OnnxGraph(original).writers
-    # 1.
-    factors = _scale_activations(networks, [networks.graph.writers[name] for name in changed])
+    writers = networks.graph.writers
+    # 1. The last of several operators may have become a part of a convolution behind it.
+    whole = [writers[name] for name in changed if name in writers]
+    factors = _scale_activations(networks, whole)
     # 2.
-    behind = set(changed)
+    behind = {name for name in writers if name in changed or name.rpartition(".")[0] in changed}
     convolutions = []
     for node in networks.graph.nodes:
         if behind.intersection(node.inputs):

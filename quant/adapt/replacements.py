@@ -4,7 +4,8 @@ By another function:
 
 1. x * Sigmoid(x), SiLU, becomes HardSwish; so do x * Sigmoid(c x), the quick GELU, and
    x * (1 + Erf(x / sqrt(2))) / 2, the GELU, which differs from it by 0.02 at most for c = 1.702.
-2. Another Sigmoid becomes HardSigmoid.
+2. Another Sigmoid becomes HardSigmoid, and a Tanh a line of slope `TANH_SLOPE` that is clipped at
+   -1 and 1, as ReLU6 of a scaled and shifted input.
 3. LeakyReLU of another slope, and PReLU, become LeakyReLU of 26/256.
 
 Exactly, but for the rounding of float32:
@@ -20,7 +21,7 @@ And by another function again:
 7. Maps that are padded by reflection or by their edge are padded by zeros. The host mirrors the
    image beyond its borders and crops the result, so that the zeros lie outside of it.
 
-Mish, Tanh, ELU and Softplus stay: no function of the DPU is near enough to be fitted.
+Mish, ELU and Softplus stay: no function of the DPU is near enough to be fitted.
 """
 
 from collections.abc import Collection
@@ -53,6 +54,7 @@ class Kind(StrEnum):
 
     silu = "SiLU or GELU"
     sigmoid = "Sigmoid"
+    tanh = "Tanh"
     hard_sigmoid = "HardSigmoid of another slope"
     leaky_relu = "LeakyReLU of another slope"
     prelu = "PReLU"
@@ -63,6 +65,7 @@ class Kind(StrEnum):
 APPROXIMATIONS = {
     Kind.silu: "HardSwish",
     Kind.sigmoid: "HardSigmoid",
+    Kind.tanh: "a clipped line",
     Kind.leaky_relu: "LeakyReLU of 26/256",
     Kind.prelu: "LeakyReLU of 26/256",
     Kind.attention: "attention on an eighth of the sides",
@@ -75,6 +78,8 @@ EXACT = {
     Kind.prelu: "ReLU in a second branch, and an Add",
 }
 """The exact replacement of each kind (4 and 5)."""
+TANH_SLOPE = 0.8
+"""Of 0.6 to 1 the slope with the least error for inputs whose deviation is 1 to 2."""
 
 
 def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
@@ -88,12 +93,15 @@ def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
         The kind; None if the node is not replaced, such as a Sigmoid that is a part of a SiLU.
     """
     attributes = node.attributes
-    if shrinking(graph, node):
-        return Kind.attention
-    if silu_input(graph, node):
-        return Kind.silu
-    if pads_of(graph, node):
-        return Kind.padding
+    kinds = {
+        Kind.attention: shrinking(graph, node),
+        Kind.silu: silu_input(graph, node),
+        Kind.padding: pads_of(graph, node),
+        Kind.tanh: node.op_type == "Tanh",
+    }
+    for kind, is_of_kind in kinds.items():
+        if is_of_kind:
+            return kind
     if node.op_type == "Sigmoid":
         (result,) = node.outputs
         readers = graph.readers[result]
@@ -132,6 +140,9 @@ def silu_input(graph: OnnxGraph, node: Node) -> str:
             if gelu and other_operand(graph, graph.writers.get(source), "Mul", 0.5) == gelu:
                 return gelu
             before = graph.writers.get(gate)
+            halved = other_operand(graph, before, "Mul", 0.5)
+            if halved and gelu_gate_input(graph, halved) == source:
+                return source
             if before is not None and before.op_type == "Sigmoid":
                 scaled = graph.writers.get(before.inputs[0])
                 is_source = before.inputs[0] == source
@@ -213,7 +224,7 @@ def replaced(
             for node in nodes:
                 plan |= aligned(graph, node)
         elif kind in approximated and kind is not Kind.padding:
-            plan |= {node: [_approximation(graph, node, kind)] for node in nodes}
+            plan |= {node: _approximation(graph, node, kind) for node in nodes}
         elif kind in exact and kind is Kind.hard_sigmoid:
             plan |= {node: _scaled_hard_sigmoid(graph, node) for node in nodes}
         elif kind in exact:
@@ -229,20 +240,41 @@ def replaced(
     return network
 
 
-def _approximation(graph: OnnxGraph, node: Node, kind: Kind) -> Node:
-    """Return the node of another function that replaces an activation.
+def _approximation(graph: OnnxGraph, node: Node, kind: Kind) -> list[Node]:
+    """Return the nodes of another function that replaces an activation.
 
     Args:
         graph: the graph that the node belongs to.
-        node: the Mul of a SiLU or GELU, a Gelu, a Sigmoid, a LeakyReLU or a PReLU.
+        node: the Mul of a SiLU or GELU, a Gelu, a Sigmoid, a Tanh, a LeakyReLU or a PReLU.
         kind: its kind.
     """
     (output,) = node.outputs
     if kind is Kind.silu:
-        return Node.new("HardSwish", [silu_input(graph, node)], output, node.name)
+        return [Node.new("HardSwish", [silu_input(graph, node)], output, node.name)]
     if kind is Kind.sigmoid:
-        return Node.new("HardSigmoid", node.inputs, output, node.name, alpha=1 / 6, beta=0.5)
-    return Node.new("LeakyRelu", node.inputs[:1], output, node.name, alpha=LEAKY_SLOPE)
+        return [Node.new("HardSigmoid", node.inputs, output, node.name, alpha=1 / 6, beta=0.5)]
+    if kind is Kind.tanh:
+        return _clipped_line(graph, node)
+    return [Node.new("LeakyRelu", node.inputs[:1], output, node.name, alpha=LEAKY_SLOPE)]
+
+
+def _clipped_line(graph: OnnxGraph, node: Node) -> list[Node]:
+    """Return clip(slope x, -1, 1) in place of tanh(x), as ReLU6(3 slope x + 3) / 3 - 1."""
+    (output,) = node.outputs
+    three, zero, six, minus_one = (
+        graph.add_constant(f"{output}.{number}", np.array(float(number)))
+        for number in (3, 0, 6, -1)
+    )
+    names = [f"{output}.{step}" for step in ("shifted", "clipped", "shrunk")]
+    shifted, clipped, shrunk = names
+    scaled = _times(graph, node.inputs[0], np.array([3 * TANH_SLOPE]), f"{output}.scaled")
+    return [
+        scaled,
+        Node.new("Add", [scaled.outputs[0], three], shifted, shifted),
+        Node.new("Clip", [shifted, zero, six], clipped, node.name),
+        _times(graph, clipped, np.array([1 / 3]), shrunk),
+        Node.new("Add", [shrunk, minus_one], output, f"{output}.lowered"),
+    ]
 
 
 def _scaled_hard_sigmoid(graph: OnnxGraph, node: Node) -> list[Node]:

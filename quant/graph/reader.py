@@ -69,7 +69,7 @@ REMEDIES = {
         ("GroupNormalization", "InstanceNormalization", "LayerNormalization"), NORMALISES
     ),
     **dict.fromkeys(("ReduceL2", "ReduceMax", "ReduceMean", "ReduceSum"), STATISTICS),
-    **dict.fromkeys(("PRelu", "Sigmoid", "Gelu", "Erf"), ADAPT),
+    **dict.fromkeys(("PRelu", "Sigmoid", "Tanh", "Gelu", "Erf"), ADAPT),
     **dict.fromkeys(("ConstantOfShape", "Expand", "Shape", "Size", "Tile"), OF_ONE_SIZE),
     "Pad": (
         "Pad by zeros in the convolution; 'quantize --adapt' (adapt=True) replaces reflecting "

@@ -35,8 +35,8 @@ REMEDY = (
     "what a DPU does not run."
 )
 ADAPT = (
-    "'quantize --adapt' (adapt=True) replaces SiLU, GELU, Sigmoid, LeakyReLU, PReLU and RFDN's "
-    "spatial attention, and measures the cost."
+    "'quantize --adapt' (adapt=True) replaces SiLU, GELU, Sigmoid, Tanh, LeakyReLU, PReLU and "
+    "RFDN's spatial attention, and measures the cost."
 )
 ADAPT_EXACTLY = "'quantize --adapt' (adapt=True) rewrites it exactly."
 

@@ -48,7 +48,7 @@ INSTEAD = {
         "use HardSigmoid, and HardSwish in place of SiLU, which is x * Sigmoid(x); 'quantize "
         "--adapt' replaces both"
     ),
-    "Tanh": "use HardSigmoid, scaled by the weights behind it",
+    "Tanh": "use ReLU6 of a scaled and shifted input; 'quantize --adapt' replaces it so",
     "Log": "leave it to the host, in front of the network",
     "Sqrt": "leave it to the host, in front of the network",
     "Softmax": "leave it to the host, behind the network",
