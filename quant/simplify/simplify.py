@@ -10,11 +10,12 @@ these properties:
    convolution that only it reads, nor in front of convolutions where folding is exact. A remaining
    BatchNormalization of images is a depthwise 1 x 1 convolution. Zeros that Pad adds are the
    convolution's own.
-4. Sub of two maps is Add, Max, Min and Abs of maps are Adds with ReLU, Sum is Add, a mean over the
-   image is GlobalAveragePool. HardSwish is one operator, ReLU6 is Clip from 0 to 6, and a Clip at 0
-   alone is ReLU. Activations precede what only moves values. Nothing splits or crops a map: each
-   part is computed separately. Kernels have at most 64 positions. Nothing is computed from the size
-   of the image, unless the size has an effect. The channels of the image come first.
+4. Sub of two maps is Add, Max, Min and Abs of maps are Adds with ReLU, Sum is Add, a square is a
+   product, a mean over the image is GlobalAveragePool. HardSwish is one operator, ReLU6 is Clip from
+   0 to 6, and a Clip at 0 alone is ReLU. Activations precede what only moves values. Nothing splits
+   or crops a map: each part is computed separately. Kernels have at most 64 positions. Nothing is
+   computed from the size of the image, unless the size has an effect. The channels of the image
+   come first.
 5. Operators are those of opset 17, unless one has no form there.
 6. The result of a network without padding has the image's size, or a multiple of it: the image is
    mirrored beyond its borders.
@@ -81,6 +82,7 @@ from beers_deploy.quant.simplify.standard_operators import (
     drop_cast,
     drop_where,
     float_shapes,
+    multiply_squares,
     pool_mean,
     shrink_by_convolution,
     split_sums,
@@ -161,7 +163,12 @@ def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 def _run_passes(model: onnx.ModelProto) -> None:
     """Rewrite the nodes of a network in place, without renaming its inputs and outputs."""
     graph = OnnxGraph(model)
-    for replacement in (clip_last, choose_by_relu, partial(drop_where, float_shapes(graph))):
+    for replacement in (
+        clip_last,
+        choose_by_relu,
+        multiply_squares,
+        partial(drop_where, float_shapes(graph)),
+    ):
         graph.rewrite(replacement)
     # What was replaced would count as a reader.
     graph.save()

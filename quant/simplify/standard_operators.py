@@ -121,6 +121,22 @@ def choose_by_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
     ]
 
 
+def multiply_squares(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace the square of a map by its product with itself.
+
+    Args:
+        graph: the graph that the node belongs to.
+        node: any node.
+
+    Returns:
+        The product; None if the node is no power of 2.
+    """
+    exponent = graph.value(node, 1) if node.op_type == "Pow" else None
+    if exponent is None or exponent.size != 1 or exponent.item() != 2:
+        return None
+    return [Node.new("Mul", [node.inputs[0]] * 2, node.outputs[0], node.name)]
+
+
 def drop_where(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Remove a Where by a constant that chooses one of two maps everywhere, as torch writes a lerp.
 

@@ -233,6 +233,7 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         f"c = {SAME}(x, one) t = Tile(c, four_channels) y = Mul(t, x)",
         {"Conv": 2, "Mul": 1},
     ),
+    "a square": (f"{CONV} y = Pow(c, two)", {"Conv": 1, "Mul": 1}),
     "zero padding": ("p = Pad(x, pads) y = Conv(p, w)", {"Conv": 1}),
     "uneven zero padding": ("p = Pad(x, around) y = Conv(p, w)", {"Conv": 1}),
     "mirrored padding": ('p = Pad<mode="reflect">(x, pads) y = Conv(p, w)', {"Pad": 1, "Conv": 1}),
