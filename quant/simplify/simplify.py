@@ -11,11 +11,11 @@ these properties:
    BatchNormalization of images is a depthwise 1 x 1 convolution. Zeros that Pad adds are the
    convolution's own.
 4. Sub of two maps is Add, Max, Min and Abs of maps are Adds with ReLU, Sum is Add, a square is a
-   product, a mean over the image is GlobalAveragePool. HardSwish is one operator, ReLU6 is Clip from
-   0 to 6, and a Clip at 0 alone is ReLU. Activations precede what only moves values. Nothing splits
-   or crops a map: each part is computed separately. Kernels have at most 64 positions. Nothing is
-   computed from the size of the image, unless the size has an effect. The channels of the image
-   come first.
+   product, a mean over the image is GlobalAveragePool. HardSwish is one operator, ReLU6 is Clip
+   from 0 to 6, and a Clip at 0 alone is ReLU. Activations precede what only moves values. Nothing
+   splits or crops a map: each part is computed separately. Kernels have at most 64 positions.
+   Nothing is computed from the size of the image, unless the size has an effect. The channels of
+   the image come first.
 5. Operators are those of opset 17, unless one has no form there.
 6. The result of a network without padding has the image's size, or a multiple of it: the image is
    mirrored beyond its borders.
