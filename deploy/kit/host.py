@@ -8,7 +8,8 @@ factors. The script needs NumPy, host.json and onnxruntime; a board needs other 
 
 1. Each tile goes to core.onnx. Where host.json has exposures, core-x4.onnx restores dark pixels,
    multiplied by 4, and so on (`factors`, `exposed`).
-2. Around a core, the host encodes the tile as int8 planes, and adds the result to it (`restored`).
+2. Around a core, the host encodes the tile as int8 planes, and adds the result to the tile, or to
+   channels of it, also enlarged (`restored`, `base`).
 3. After the last tile, the consistency step (`consistent`) smooths the dark and corrects low
    spatial frequencies.
 4. Then the self-check (`judged`) writes two figures of each block into restored-check.npy.
