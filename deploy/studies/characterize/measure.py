@@ -1,7 +1,7 @@
 """Measure noise and MTF of a sensor from its raw frames (`model.metrics.instrument`)."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -33,9 +33,6 @@ STILL_DRIFT = 0.02
 """Limits for the difference of two frames of a still scene: structure over noise, and the largest
 change of level.
 """
-
-Edges = dict[str, list[Edge]]
-Variance = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -153,21 +150,13 @@ def measure_mtf(
     def variance(dn: np.ndarray) -> np.ndarray:
         return noise.total(dn - frames.black_dn)
 
-    edges = _boxed(frames, boxes, variance) if boxes else _searched(frames, variance)
-    # Edges in boxes all count; searched ones count if they are as sharp as the sharpest.
-    return axis_curves(edges, searched=not boxes)
-
-
-def _boxed(frames: Frames, boxes: Mapping[str, np.ndarray], variance: Variance) -> Edges:
-    """Return the edges in boxes. Those near the horizontal are transposed to be near the
-    vertical.
-    """
-    edges: Edges = {axis: [] for axis in AXES}
+    full_scale_dn = frames.full_scale_dn
+    edges: dict[str, list[Edge]] = {axis: [] for axis in AXES}
     for words, region in boxes.items():
         lies = _rise(region.T) > _rise(region)
         # An edge near the horizontal is turned upright, because edges are measured along the rows.
         edge = edge_in(region.T if lies else region, variance, words)
-        if region.min() <= 0 or region.max() >= frames.full_scale_dn:
+        if region.min() <= 0 or region.max() >= full_scale_dn:
             edge = Refusal("clipped pixels")
         if isinstance(edge, Refusal):
             raise ImageError(
@@ -175,21 +164,15 @@ def _boxed(frames: Frames, boxes: Mapping[str, np.ndarray], variance: Variance) 
                 f"not: {edge.reason}. Box another edge, or draw a tighter box."
             )
         edges["along" if lies else "across"].append(edge)
-    return edges
-
-
-def _searched(frames: Frames, variance: Variance) -> Edges:
-    """Return the edges of all frames. Those near the horizontal are transposed to be near the
-    vertical.
-    """
-    edges: Edges = {axis: [] for axis in AXES}
-    with steps("looking for edges", len(frames.paths)) as bar:
-        for path in frames.paths:
-            for tile in frames.tiles(path):
-                for axis, pixels in zip(AXES, (tile, tile.T), strict=True):
-                    edges[axis] += find_edges(pixels, variance, frames.full_scale_dn, path.name)
-            bar.advance()
-    return edges
+    if not boxes:
+        with steps("looking for edges", len(frames.paths)) as bar:
+            for path in frames.paths:
+                for tile in frames.tiles(path):
+                    edges["across"] += find_edges(tile, variance, full_scale_dn, path.name)
+                    edges["along"] += find_edges(tile.T, variance, full_scale_dn, path.name)
+                bar.advance()
+    # Edges in boxes all count; searched ones count if they are as sharp as the sharpest.
+    return axis_curves(edges, searched=not boxes)
 
 
 def _rise(region: np.ndarray) -> float:

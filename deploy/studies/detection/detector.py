@@ -114,7 +114,22 @@ class Detector:
                 f"The detector returns scores outside 0 to 1, perhaps logits or an objectness. "
                 f"{REMEDY}"
             )
-        return _final(output[0], len(self.names)) if final else suppress(_raw(output[0]))
+        if not final:
+            # Every pair of an anchor and a class with a sufficient score is a candidate.
+            classes, anchors = np.nonzero(scores[0] > MIN_SCORE)
+            middle = output[0][:2, anchors].T.astype(np.float64)
+            half = output[0][2:4, anchors].T.astype(np.float64) / 2
+            corners = np.hstack([middle - half, middle + half])
+            return suppress(Boxes.of(corners, classes, scores[0, classes, anchors]))
+        # Rows of zeros pad the list.
+        rows = output[0][scores[0] > MIN_SCORE]
+        if not np.isin(rows[:, 5], np.arange(len(self.names))).all():
+            raise ModelError(
+                f"The detector returns classes other than 0 to {len(self.names) - 1} in its sixth "
+                f"column. {REMEDY}"
+            )
+        rows = rows[np.argsort(-rows[:, 4], kind="stable")[:MAX_BOXES]]
+        return Boxes.of(rows[:, :4], rows[:, 5], rows[:, 4])
 
 
 def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> Detector:
@@ -140,7 +155,18 @@ def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> D
             f"The metadata of {path} must have the names of its classes, such as "
             f"{{0: 'ship', ...}}, but it has {stated}. {REMEDY}"
         )
-    _require_layout(model, about.get("task", "detect"), len(names), path)
+    task = about.get("task", "detect")
+    channels = _sizes(model.graph.input[0])[1:2]
+    outputs = [_sizes(value) for value in model.graph.output]
+    is_read = len(outputs) == 1 and _is_read(outputs[0], len(names))
+    if task != "detect" or channels != [3] or not is_read:
+        shapes = ", ".join(" x ".join(map(str, sizes)) for sizes in outputs)
+        facts = f"task {task}, {' '.join(map(str, channels))} channels, output {shapes}"
+        raise ModelError(
+            f"{path} must have a detector's output as Ultralytics exports it for RGB, "
+            f"1 x {4 + len(names)} x anchors for {len(names)} classes (raw) or 1 x N x 6 (nms=True "
+            f"or end2end), but it has {printable(facts)}. {REMEDY}"
+        )
     size = _size_px(fixed_tile_px(model), about.get("imgsz"), size_px, path)
     return Detector(names, size, _flag(model), partial(_answer, open_session(model, threads), path))
 
@@ -165,20 +191,6 @@ def _literal(text: str) -> Any:
         return ast.literal_eval(text) if len(text) <= LITERAL else text
     except (MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
         return text
-
-
-def _require_layout(model: onnx.ModelProto, task: Any, classes: int, path: Path) -> None:
-    channels = _sizes(model.graph.input[0])[1:2]
-    outputs = [_sizes(value) for value in model.graph.output]
-    if task == "detect" and channels == [3] and len(outputs) == 1 and _is_read(outputs[0], classes):
-        return
-    shapes = ", ".join(" x ".join(map(str, sizes)) for sizes in outputs)
-    facts = f"task {task}, {' '.join(map(str, channels))} channels, output {shapes}"
-    raise ModelError(
-        f"{path} must have a detector's output as Ultralytics exports it for RGB, "
-        f"1 x {4 + classes} x anchors for {classes} classes (raw) or 1 x N x 6 (nms=True or "
-        f"end2end), but it has {printable(facts)}. {REMEDY}"
-    )
 
 
 def _is_read(shape: Sequence[int], classes: int) -> bool:
@@ -230,29 +242,6 @@ def _flag(model: onnx.ModelProto) -> str:
         f"The detector's own suppression drops what lies below {where}, so average precision is "
         "too low: export it without nms, or with conf=0.001."
     )
-
-
-def _raw(output: np.ndarray) -> Boxes:
-    """Return every pair of an anchor and a class with a sufficient score, in px of the input."""
-    classes, anchors = np.nonzero(output[4:] > MIN_SCORE)
-    middle = output[:2, anchors].T.astype(np.float64)
-    half = output[2:4, anchors].T.astype(np.float64) / 2
-    corners = np.hstack([middle - half, middle + half])
-    return Boxes.of(corners, classes, output[4 + classes, anchors])
-
-
-def _final(output: np.ndarray, classes: int) -> Boxes:
-    """Return the rows with a sufficient score, best first. The other rows pad the list with
-    zeros.
-    """
-    rows = output[output[:, 4] > MIN_SCORE]
-    if not np.isin(rows[:, 5], np.arange(classes)).all():
-        raise ModelError(
-            f"The detector returns classes other than 0 to {classes - 1} in its sixth column. "
-            f"{REMEDY}"
-        )
-    rows = rows[np.argsort(-rows[:, 4], kind="stable")[:MAX_BOXES]]
-    return Boxes.of(rows[:, :4], rows[:, 5], rows[:, 4])
 
 
 def letters(name: str) -> str:

@@ -9,7 +9,6 @@ Boxes are in continuous pixels of the image, pixel i covering [i, i + 1):
 """
 
 import math
-import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
@@ -88,25 +87,24 @@ def read_labelled(
         raise OptionError(
             f"`split` needs folders as VOC and DIOR have them, but {images} has none. Leave it out."
         )
-    where = labels or _labels_near(images)
+    where = labels
+    if where is None:
+        # This refuses a folder without images.
+        list_images(images)
+        where = images
+        # Without XML files next to the images, their labels are one JSON file there.
+        if not any(path.suffix.lower() == ".xml" for path in images.iterdir()):
+            json_files = sorted(images.glob("*.json"))
+            if len(json_files) != 1:
+                raise OptionError(
+                    f"{images} must have .xml files of VOC labels or one .json file of COCO "
+                    f"labels, but it has {len(json_files)} .json files. Give the labels as "
+                    "`labels`."
+                )
+            where = json_files[0]
     if where.suffix.lower() == ".json":
         return _labelled_set(*_read_coco(where, images))
     return _labelled_set(*_read_each(list_images(images), where))
-
-
-def _labels_near(folder: Path) -> Path:
-    """Return the path of the labels of a folder's images: next to them, or a JSON file."""
-    # This call refuses a folder without images.
-    list_images(folder)
-    if any(path.suffix.lower() == ".xml" for path in folder.iterdir()):
-        return folder
-    json_files = sorted(folder.glob("*.json"))
-    if len(json_files) != 1:
-        raise OptionError(
-            f"{folder} must have .xml files of VOC labels or one .json file of COCO labels, but it "
-            f"has {len(json_files)} .json files. Give the labels as `labels`."
-        )
-    return json_files[0]
 
 
 def _read_each(images: Sequence[Path], where: Path) -> tuple[list[_File], list[str]]:
@@ -203,7 +201,8 @@ def _read_voc_tree(folder: Path, split: str | None) -> list[_File]:
     list_name = split or "test"
     if list_name in lists:
         # A list of one class has a number after each name.
-        stems = sorted({line.split()[0] for line in _lines(lists[list_name])})
+        text = _read_bytes(lists[list_name]).decode("utf-8-sig", "replace")
+        stems = sorted({line.split()[0] for line in text.splitlines() if line.strip()})
     elif split:
         raise OptionError(
             f"`split` must be one of the splits of {folder} ({', '.join(lists) or 'none'}), but "
@@ -229,23 +228,17 @@ def _read_voc(image: Path, labels: Path) -> _File:
     height, width = _numbers(
         [root.findtext(f"size/{name}", "0") for name in ("height", "width")], labels, "size"
     )
-    return _File(
-        image, labels, [_voc_box(entry, labels) for entry in root.iter("object")], (height, width)
-    )
-
-
-def _voc_box(entry: ET.Element, path: Path) -> Box:
-    name = (entry.findtext("name") or "").strip()
-    if not name:
-        raise OptionError(f"{path} has an object without a name. {CORRECT}")
-    corners = [entry.findtext(f"bndbox/{corner}", "none") for corner in CORNERS]
-    left, top, right, bottom = _numbers(corners, path, f"{', '.join(CORNERS)} of a {name!r}")
-    # VOC's corners count pixels from 1 and belong to the box.
-    return (
-        name,
-        (left - 1, top - 1, right, bottom),
-        (entry.findtext("difficult") or "0").strip() == "1",
-    )
+    boxes: list[Box] = []
+    for entry in root.iter("object"):
+        name = (entry.findtext("name") or "").strip()
+        if not name:
+            raise OptionError(f"{labels} has an object without a name. {CORRECT}")
+        corners = [entry.findtext(f"bndbox/{corner}", "none") for corner in CORNERS]
+        left, top, right, bottom = _numbers(corners, labels, f"{', '.join(CORNERS)} of a {name!r}")
+        ignored = (entry.findtext("difficult") or "0").strip() == "1"
+        # VOC's corners count pixels from 1 and belong to the box.
+        boxes.append((name, (left - 1, top - 1, right, bottom), ignored))
+    return _File(image, labels, boxes, (height, width))
 
 
 def _read_coco(labels: Path, folder: Path) -> tuple[list[_File], list[str]]:
@@ -314,11 +307,6 @@ def _inside(folder: Path, name: str) -> Path | None:
     return next(
         (path for path in (folder / name, folder / Path(name).name) if path.is_file()), None
     )
-
-
-def _lines(path: Path) -> list[str]:
-    text = _read_bytes(path).decode("utf-8-sig", "replace")
-    return [line for line in text.splitlines() if line.strip()]
 
 
 def _read_bytes(path: Path) -> bytes:

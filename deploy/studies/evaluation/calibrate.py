@@ -102,9 +102,8 @@ def interval_from_pairs(
         )
     parts: tuple[list[Sample], list[Sample]] = ([], [])
     for pair in pairs:
-        truth = pair.reference if pair.noise_free is None else pair.noise_free
         restored = restore(pair.degraded)
-        sample = Sample.of(pair.degraded, restored, truth, sensor.nominal())
+        sample = Sample.of(pair.degraded, restored, pair.truth, sensor.nominal())
         parts[sites.index(pair.site) % 2].append(sample)
     # The larger part calibrates, because a level needs so many images.
     return calibrated(*sorted(parts, key=len))

@@ -11,7 +11,6 @@ from itertools import product
 from pathlib import Path
 from typing import Final
 
-import onnx
 import torch
 
 from beers_deploy.conditioned_file import to_run_on
@@ -20,14 +19,12 @@ from beers_deploy.model.traditional.baselines import BASELINES
 from beers_deploy.model.traditional.patch_groups import QUALITIES
 from beers_deploy.model.traditional.pipeline import Order, TraditionalPipeline, restore_traditional
 from beers_deploy.network import Network
-from beers_deploy.network_files import other_sensor
+from beers_deploy.network_files import UNKNOWN_SENSORS, other_sensor
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND as NOT_KNOWN
-from beers_deploy.profiles.shipped import BLIND_PROFILE
-from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.restoration.method import Restore, network_method
 from beers_deploy.restoration.plan import Plan
 from beers_deploy.restoration.steps import BOTH, Around, exposures_of
@@ -182,7 +179,13 @@ def method_of(
             for the name of `sensor`.
     """
     restore = network_restore(network, sensor, reference.nominal(), around)
-    return Method(name, restore, knowledge_of(network.model, acquired_by or sensor.name))
+    known = f"another: {network.sensor}"
+    # A file without a sensor in its metadata was conditioned on none.
+    if network.sensor in UNKNOWN_SENSORS:
+        known = BLIND
+    elif network.sensor == (acquired_by or sensor.name):
+        known = KNOWN
+    return Method(name, restore, known)
 
 
 def network_restore(
@@ -215,21 +218,6 @@ def network_restore(
     if around.consistency and sensor.name != NOT_KNOWN:
         aim = reference.in_units_of(instrument)
     return network_method(network.model, instrument.max_dn, exposed, instrument, aim, plan_of)
-
-
-def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:
-    """Return in words what a network knows of the sensor of the images: "known", "blind" or
-    "another: NAME".
-
-    Args:
-        model: the network, whose metadata names the sensor that it was conditioned on.
-        sensor_name: the name of the images' sensor.
-    """
-    own = metadata(model).get("sensor", "")
-    # A file without a sensor in its metadata was conditioned on none.
-    if own in ("", NOT_KNOWN, BLIND_PROFILE):
-        return BLIND
-    return KNOWN if own == sensor_name else f"another: {own}"
 
 
 def profile_of(sensor: Instrument, like: Sensor) -> Sensor:

@@ -53,6 +53,11 @@ class NamedPair:
         """
         return self.place or site_of(self.name)
 
+    @property
+    def truth(self) -> np.ndarray:
+        """The reference without noise if it is known, else the reference."""
+        return self.reference if self.noise_free is None else self.noise_free
+
 
 def pairs_of_scenes(
     images: Path | None, degraded: Sensor, reference: Sensor, seed: int, brightness: float = 1.0

@@ -198,8 +198,7 @@ class Instruments:
         # A clipped pixel has lost light before any method sees it: it does not count as an error.
         unclipped = (pair.reference < self.max_dn) & (pair.degraded < self.max_dn)
         # The mean of a noisy reference has an error of its own.
-        level = pair.reference if clean is None else clean
-        scores[BIAS] = bias_percent(dn, level, unclipped, self.offset_dn)
+        scores[BIAS] = bias_percent(dn, pair.truth, unclipped, self.offset_dn)
         scores["SSIM"] = ssim(dn, pair.reference, self.max_dn)
         for name, distance in self.perceptual.items():
             both = dn / self.max_dn, pair.reference / self.max_dn

@@ -220,26 +220,19 @@ def transfer_figure(method: Method, patterns: Sequence[Pattern]) -> Figure:
         The mean over the quarters of all patterns, with its 90 % interval; 1 is the contrast of the
         reference.
     """
-    values: list[float] = []
+    values = []
     for pattern in patterns:
-        values += _transfers(method.restore(pattern.acquired), pattern)
+        restored = method.restore(pattern.acquired)
+        height, width = restored.shape
+        for number in range(4):
+            below, right = divmod(number, 2)
+            rows = slice(below * height // 2, (below + 1) * height // 2)
+            columns = slice(right * width // 2, (right + 1) * width // 2)
+            mask = pattern.measured[rows, columns]
+            truth = pattern.expected[rows, columns][mask].astype(np.float64)
+            # Without the mean, the slope of the least-squares fit depends only on contrast, not on
+            # the level of the image.
+            truth -= truth.mean()
+            values.append(float(truth @ restored[rows, columns][mask] / (truth @ truth)))
     source = f"{len(values)} parts of {len(patterns)} simulated patterns"
     return _mean(values, OF_REFERENCE, source)
-
-
-def _transfers(restored: np.ndarray, pattern: Pattern) -> list[float]:
-    """Return the slope of the least-squares fit of a restored pattern on the wanted one, in each
-    quarter.
-    """
-    slopes = []
-    height, width = restored.shape
-    for number in range(4):
-        below, right = divmod(number, 2)
-        rows = slice(below * height // 2, (below + 1) * height // 2)
-        columns = slice(right * width // 2, (right + 1) * width // 2)
-        mask = pattern.measured[rows, columns]
-        truth = pattern.expected[rows, columns][mask].astype(np.float64)
-        # Without the mean, the slope depends only on contrast, not on the level of the image.
-        truth -= truth.mean()
-        slopes.append(float(truth @ restored[rows, columns][mask] / (truth @ truth)))
-    return slopes

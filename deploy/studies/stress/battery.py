@@ -255,15 +255,14 @@ def worst_rows(results: Iterable[StageResult]) -> list[Row]:
     """Return a row for each check of each stage: its worst value over all cases, the bound, and the
     case.
     """
-    by_name: dict[str, list[tuple[Measure, str]]] = {}
+    worst_of: dict[str, tuple[Measure, str]] = {}
     for result in results:
         for measure in result.measures:
-            by_name.setdefault(f"{result.stage}: {measure.check}", []).append(
-                (measure, result.case.name)
-            )
+            name = f"{result.stage}: {measure.check}"
+            if name not in worst_of or _excess(measure) > _excess(worst_of[name][0]):
+                worst_of[name] = measure, result.case.name
     rows = []
-    for name, sizes in by_name.items():
-        largest, case = max(sizes, key=lambda pair: _excess(pair[0]))
+    for name, (largest, case) in worst_of.items():
         text = {
             "allowed": f"{largest.allowed:.4g} {largest.unit}",
             "worst case": case,

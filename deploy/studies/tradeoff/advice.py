@@ -97,38 +97,38 @@ def parse_constraints(option: str, text: str | None) -> list[Constraint]:
     Raises:
         OptionError: a part has another form, or names an unknown figure or another unit.
     """
-    return [_parse(option, part.strip()) for part in text.split(",")] if text is not None else []
-
-
-def _parse(option: str, text: str) -> Constraint:
-    fields = CONSTRAINT.fullmatch(text.lower())
-    if fields is None or not math.isfinite(float(fields["limit"])):
-        raise OptionError(
-            f"`{option}` must be NAME<=NUMBER or NAME>=NUMBER, such as 'latency<=20s' or "
-            f"'psnr>=44', but it is {printable(repr(text))}."
-        )
-    if fields["name"] not in NAMES:
-        raise OptionError(
-            f"`{option}` must name one of {', '.join(NAMES)}, but it names "
-            f"{printable(repr(fields['name']))}."
-        )
-    key, unit = NAMES[fields["name"]]
-    if fields["unit"] not in ("", unit.lower()):
-        raise OptionError(
-            f"`{option}` must give {key} in {unit}, but its unit is "
-            f"{printable(repr(fields['unit']))}. Convert the number to {unit}."
-        )
-    limit = Constraint(key, fields["side"] == "<=", float(fields["limit"]), unit)
-    if limit.at_most == (fields["name"] in BETTER_LARGER):
-        sign = ">=" if limit.at_most else "<="
-        raise OptionError(
-            f"`{option}` must limit {key} from {'below' if limit.at_most else 'above'}, but it is "
-            f"{limit}. Write {fields['name']}{sign}{fields['limit']}{fields['unit']}."
-        )
-    # Every figure that can have an upper limit is above 0, so that no point would comply.
-    if limit.at_most and limit.limit <= 0:
-        raise OptionError(f"`{option}` must give an upper limit above 0, but it is {limit}.")
-    return limit
+    limits = []
+    for part in map(str.strip, [] if text is None else text.split(",")):
+        fields = CONSTRAINT.fullmatch(part.lower())
+        if fields is None or not math.isfinite(float(fields["limit"])):
+            raise OptionError(
+                f"`{option}` must be NAME<=NUMBER or NAME>=NUMBER, such as 'latency<=20s' or "
+                f"'psnr>=44', but it is {printable(repr(part))}."
+            )
+        name, side, number, written_unit = fields.group("name", "side", "limit", "unit")
+        if name not in NAMES:
+            raise OptionError(
+                f"`{option}` must name one of {', '.join(NAMES)}, but it names "
+                f"{printable(repr(name))}."
+            )
+        key, unit = NAMES[name]
+        if written_unit not in ("", unit.lower()):
+            raise OptionError(
+                f"`{option}` must give {key} in {unit}, but its unit is "
+                f"{printable(repr(written_unit))}. Convert the number to {unit}."
+            )
+        limit = Constraint(key, side == "<=", float(number), unit)
+        if limit.at_most == (name in BETTER_LARGER):
+            way, sign = ("below", ">=") if limit.at_most else ("above", "<=")
+            raise OptionError(
+                f"`{option}` must limit {key} from {way}, but it is {limit}. Write "
+                f"{name}{sign}{number}{written_unit}."
+            )
+        # Every figure that can have an upper limit is above 0, so that no point would comply.
+        if limit.at_most and limit.limit <= 0:
+            raise OptionError(f"`{option}` must give an upper limit above 0, but it is {limit}.")
+        limits.append(limit)
+    return limits
 
 
 @dataclass(frozen=True)

@@ -226,7 +226,17 @@ def figure_of(study: Tradeoff) -> "Figure":
             figure.legend(loc="outside lower center", ncols=LEGEND_COLUMNS)
         # The distances between marks are known when the axes have their size.
         figure.draw_without_rendering()
-        _draw_numbers(axes, study)
+        x, y = _places(study.front, study.cost)
+        places_px = axes.transData.transform(np.column_stack([x, y]))
+        first = 0
+        for number in range(1, len(x) + 1):
+            # Neighbours whose marks overlap share a label.
+            if number < len(x) and math.dist(places_px[number], places_px[first]) < NEAR_PX:
+                continue
+            words = str(number) if number == first + 1 else f"{first + 1}\u2013{number}"
+            at = x[first], y[first]
+            axes.annotate(words, at, (-8, 9), "data", "offset points", ha="right", weight="bold")
+            first = number
     return figure
 
 
@@ -247,7 +257,14 @@ def draw(axes: "Axes", study: Tradeoff) -> None:
         x, y = _places([study.best], study.cost)
         ring: dict[str, Any] = {"facecolors": "none", "edgecolors": LIGHT["ink"], "linewidths": 1.8}
         axes.scatter(x, y, s=RING_PX2, label="recommended", zorder=4, **ring)
-    _draw_legend(axes, groups, study)
+    # The entries of the legend are marks without a point: networks by colour, and boards by marker.
+    several = len(study.boards) > 1
+    networks = {
+        group.name: (group.colour, MARKERS[0] if several else group.marker) for group in groups
+    }
+    boards = {group.board: (LIGHT["soft"], group.marker) for group in groups} if several else {}
+    for name, (colour, marker) in (*networks.items(), *sorted(boards.items())):
+        axes.scatter([], [], s=FRONT_PX2, c=colour, marker=marker, label=name, linewidths=0)
     if groups:
         set_ticks(axes.xaxis, 6)
         set_ticks(axes.yaxis, 8)
@@ -331,35 +348,6 @@ def _draw_limits(axes: "Axes", study: Tradeoff) -> None:
             axes.annotate(words, place, xycoords=("data", "axes fraction"), ha=side, va="bottom")
         elif limit.key == PSNR and axes.get_ylim()[0] <= limit.limit <= axes.get_ylim()[1]:
             axes.axhline(limit.limit, **style)
-
-
-def _draw_legend(axes: "Axes", groups: Sequence[Series], study: Tradeoff) -> None:
-    """Add the entries of the legend, as marks without a point: networks by colour, and for several
-    boards the markers.
-    """
-    several = len(study.boards) > 1
-    networks = {
-        group.name: (group.colour, MARKERS[0] if several else group.marker) for group in groups
-    }
-    boards = {group.board: (LIGHT["soft"], group.marker) for group in groups} if several else {}
-    for name, (colour, marker) in (*networks.items(), *sorted(boards.items())):
-        axes.scatter([], [], s=FRONT_PX2, c=colour, marker=marker, label=name, linewidths=0)
-
-
-def _draw_numbers(axes: "Axes", study: Tradeoff) -> None:
-    """Write the members' numbers next to their marks, with one label for neighbours whose marks
-    overlap.
-    """
-    x, y = _places(study.front, study.cost)
-    places_px = axes.transData.transform(np.column_stack([x, y]))
-    first = 0
-    for number in range(1, len(x) + 1):
-        if number < len(x) and math.dist(places_px[number], places_px[first]) < NEAR_PX:
-            continue
-        words = str(number) if number == first + 1 else f"{first + 1}\u2013{number}"
-        at = x[first], y[first]
-        axes.annotate(words, at, (-8, 9), "data", "offset points", ha="right", weight="bold")
-        first = number
 
 
 def _label(study: Tradeoff, key: str) -> str:

@@ -207,31 +207,25 @@ def network_points(variant: Variant, boards: Sequence[TargetProfile], whole: Swa
     """
     if variant.precision == FLOAT:
         return [Point(variant, reason=FLOAT_ON_DPU)]
-    points = []
+    points = list[Point]()
     for board in boards:
+        default = dpu_of(board)
+        others = [dpu_of(board, name) for name in board.configurations if name != default.name]
         try:
-            points += _on_board(variant, board, whole)
+            fastest_px = fastest_tile_px(variant, default, whole)
+            smaller = [halo for halo in HALOS_PX if halo < exact_halo_px(variant)]
+            here = [
+                *(Point(variant, board, dpu, fastest_px) for dpu in (default, *others)),
+                Point(variant, board, default, TILE_PX),
+                *(Point(variant, board, default, fastest_px, halo) for halo in smaller),
+            ]
+            # The fastest tile may be the paper's: a point is listed once.
+            points += {point.name: point for point in here}.values()
         except ModelError as error:
             # A board that refuses the network stays in the study, with the reason.
             reason = f"{board.name}: {str(error).rstrip('.')}"
             points.append(Point(variant, reason=reason, refused_by=board.name))
     return points
-
-
-def _on_board(variant: Variant, board: TargetProfile, swath: Swath) -> list[Point]:
-    """Return a point in each configuration, with the fastest tile of the default one.
-
-    In the default configuration there are also points with the paper's tile and smaller halos.
-    """
-    default = dpu_of(board)
-    others = [dpu_of(board, name) for name in board.configurations if name != default.name]
-    fastest_px = fastest_tile_px(variant, default, swath)
-    points = [Point(variant, board, dpu, fastest_px) for dpu in [default, *others]]
-    points.append(Point(variant, board, default, TILE_PX))
-    smaller = (halo for halo in HALOS_PX if halo < exact_halo_px(variant))
-    points += [Point(variant, board, default, fastest_px, halo) for halo in smaller]
-    # The fastest tile may be the paper's: a point is listed once.
-    return list({point.name: point for point in points}.values())
 
 
 def fastest_tile_px(variant: Variant, dpu: Dpu, whole: Swath) -> int:
