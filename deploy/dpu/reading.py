@@ -136,11 +136,37 @@ def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str) -> dict[s
         ModelError: an input is no image, has another fixed size, or cannot consist of whole
             squares; or `tile_px` is None and the file states no size.
     """
-    places = _places(model)
-    return {
-        name: _input_shape(name, sizes, tile_px, places, where)
-        for name, sizes in OnnxGraph(model).inputs.items()
-    }
+    place_px, border_px = _places(model)
+    shapes: dict[str, Shape] = {}
+    for name, sizes in OnnxGraph(model).inputs.items():
+        with faults_named(where):
+            # Without a tile a network is predicted at the sizes that its file states, if it does.
+            require_image(name, sizes, square=tile_px is not None or not all(sizes[2:]))
+        if tile_px is None:
+            if not all(sizes[2:]):
+                raise ModelError(f"{where} states no size of its input. Give `tile`.")
+            shapes[name] = sizes[1], sizes[2], sizes[3]
+            continue
+        # The tile is stated in pixels of the image, and the input counts places of several pixels.
+        side, beyond = divmod(tile_px + 2 * border_px, place_px)
+        if beyond:
+            raise ModelError(
+                f"`tile` must be a multiple of {place_px} px for {where}, got {tile_px} px. Choose "
+                "another `tile`."
+            )
+        if list(sizes[2:]) == [1, 1] and side > 1:
+            raise ModelError(
+                f"The input {printable(name)} of {where} has one pixel, so it is a parameter and "
+                "no image. Export the network with it as a constant."
+            )
+        if sizes[2] not in (0, side):
+            fixed_px = sizes[2] * place_px - 2 * border_px
+            raise ModelError(
+                f"The input of {where} is fixed to {fixed_px} x {fixed_px} pixels, but `tile` is "
+                f"{tile_px} px. Give `tile` {fixed_px}, or export the network with free sizes."
+            )
+        shapes[name] = sizes[1], side, side
+    return shapes
 
 
 class _Reader:
@@ -241,46 +267,3 @@ def _channels(
     second = weight.shape[1] * int(node.attributes.get("group", 1))
     # ONNX stores the input channels first for ConvTranspose, and the output channels for Conv.
     return (first, second) if node.op_type == "ConvTranspose" else (second, first)
-
-
-def _input_shape(
-    name: str, sizes: Sequence[int], tile_px: int | None, places: tuple[int, int], where: str
-) -> Shape:
-    """Return (C, tile, tile) of an input (N, C, H, W), in places; without a tile (C, H, W) as the
-    file states them.
-
-    Args:
-        name: the name of the input.
-        sizes: the sizes that the file states, 0 where it states none.
-        tile_px: side of the tile in pixels of the image.
-        places: the side of a place in pixels, and the number of pixels by which the planes extend
-            beyond the image.
-        where: the file, in messages.
-    """
-    with faults_named(where):
-        # Without a tile a network is predicted at the sizes that its file states, if it does.
-        require_image(name, sizes, square=tile_px is not None or not all(sizes[2:]))
-    if tile_px is None:
-        if not all(sizes[2:]):
-            raise ModelError(f"{where} states no size of its input. Give `tile`.")
-        return sizes[1], sizes[2], sizes[3]
-    # The tile is stated in pixels of the image, and the input counts places of several pixels.
-    place_px, border_px = places
-    side, beyond = divmod(tile_px + 2 * border_px, place_px)
-    if beyond:
-        raise ModelError(
-            f"`tile` must be a multiple of {place_px} px for {where}, got {tile_px} px. Choose "
-            "another `tile`."
-        )
-    if list(sizes[2:]) == [1, 1] and side > 1:
-        raise ModelError(
-            f"The input {printable(name)} of {where} has one pixel, so it is a parameter and no "
-            "image. Export the network with it as a constant."
-        )
-    if sizes[2] not in (0, side):
-        fixed_px = sizes[2] * place_px - 2 * border_px
-        raise ModelError(
-            f"The input of {where} is fixed to {fixed_px} x {fixed_px} pixels, but `tile` is "
-            f"{tile_px} px. Give `tile` {fixed_px}, or export the network with free sizes."
-        )
-    return (sizes[1], side, side)

@@ -7,7 +7,6 @@ the board can return. docs/how-to/board.md explains what a pattern usually means
 
 import os
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,28 +18,9 @@ from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.graph import PLANES
 from beers_deploy.results import Table
 
-
-@dataclass(frozen=True)
-class Written:
-    """One tensor that a board wrote for one test image, next to its golden values.
-
-    Attributes:
-        sound: the golden values, integers (N, C, H, W).
-        board: the values that the board wrote, int16 (N, C, H, W).
-    """
-
-    sound: np.ndarray
-    board: np.ndarray
-
-    @property
-    def differs(self) -> np.ndarray:
-        """Return True for each value that differs from the golden one, (N, C, H, W) bool."""
-        return np.asarray(self.sound != self.board)
-
-
-Results = Mapping[str, list[Written]]
-"""The values that a board wrote for each tensor, in the order in which they are computed, with one
-entry for each case.
+Errors = Mapping[str, list[np.ndarray]]
+"""The absolute differences (N, C, H, W) of what a board wrote from the golden values, by tensor in
+the order in which they are computed, with one array for each case.
 """
 
 
@@ -64,9 +44,9 @@ def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[st
     """
     golden = read_golden(Path(folder))
     results_folder = Path(results)
-    outputs = _results(golden, results_folder)
-    rows = tuple(_row(golden.core, name, cases) for name, cases in outputs.items())
-    wrong = [name for name, cases in outputs.items() if any(case.differs.any() for case in cases)]
+    outputs = _errors(golden, results_folder)
+    rows = tuple(_row(golden.core, name, errors) for name, errors in outputs.items())
+    wrong = [name for name, errors in outputs.items() if any(error.any() for error in errors)]
     detail = ""
     if wrong:
         detail = f"the first to differ is {_layer(golden.core, wrong[0])}"
@@ -82,8 +62,10 @@ def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[st
     )
 
 
-def _results(golden: Golden, folder: Path) -> Results:
-    """Read the results of a board. Raise OptionError for a file that is not a result."""
+def _errors(golden: Golden, folder: Path) -> Errors:
+    """Read the results of a board, and return their differences from the golden values. Raise
+    OptionError for a file that is not a result.
+    """
     if not folder.is_dir():
         raise OptionError(f"{folder} is not a folder of a board's results. Check the path.")
     files = files_of(golden.core)
@@ -99,13 +81,14 @@ def _results(golden: Golden, folder: Path) -> Results:
             f"The results in {folder} must be named CASE/LAYER.npy as in {INDEX}, got {actual}. "
             "Rename them."
         )
-    outputs: dict[str, list[Written]] = {}
+    errors: dict[str, list[np.ndarray]] = {}
     for name, file in files.items():
         for path in sorted(path for path in paths if path.name == file):
             sound = golden.cases[path.parent.name][name]
             values = _integers(path, sound.shape, golden.core.frac_bits[name])
-            outputs.setdefault(name, []).append(Written(sound, values))
-    return outputs
+            # Differences of uint8 or int8 would wrap around, so the values are int16.
+            errors.setdefault(name, []).append(np.abs(values - sound))
+    return errors
 
 
 def _integers(path: Path, shape: tuple[int, ...], frac_bits: int) -> np.ndarray:
@@ -156,19 +139,17 @@ def _unseen_before(core: IntCore, name: str, outputs: Collection[str]) -> int:
     return count
 
 
-def _row(core: IntCore, name: str, cases: list[Written]) -> Row:
+def _row(core: IntCore, name: str, errors: list[np.ndarray]) -> Row:
     """Return the share and size of the differences of a layer, and where they lie."""
-    # Differences of uint8 or int8 would wrap around, so the tensors are int16.
-    errors = [np.abs(case.board - case.sound) for case in cases]
     values = sum(error.size for error in errors)
     source = f"{len(errors)} cases, {values} values, against the integer reference"
-    differing = sum(int(case.differs.sum()) for case in cases)
+    differing = sum(map(np.count_nonzero, errors))
     figures = {
         "differing": measured(100 * differing / values, "%", source),
         "at most by": measured(max(int(error.max()) for error in errors), "LSB", source),
     }
-    worst = max(cases, key=lambda case: int(case.differs.sum()))
-    return Row("golden", _layer(core, name), figures, {"where": where(worst.differs)})
+    worst = max(errors, key=np.count_nonzero)
+    return Row("golden", _layer(core, name), figures, {"where": where(worst > 0)})
 
 
 def where(differs: np.ndarray) -> str:

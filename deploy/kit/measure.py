@@ -44,7 +44,8 @@ def main() -> int:
         # A file that cannot take the run is refused before minutes are spent on it.
         read_runs(options.out)
         entry = measure(options)
-        write_entry(entry, options.out)
+        runs = [*read_runs(options.out), entry]
+        options.out.write_text(json.dumps(runs, indent=1) + "\n", encoding="utf-8")
     except (OSError, RuntimeError, ValueError) as error:
         print(f"measure.py: {error}", file=sys.stderr)
         return 2
@@ -292,11 +293,6 @@ def throughput(stamps: list[float], batch: int) -> float:
             f"The throughput needs at least two calls, got {len(stamps)}. Give more --frames."
         )
     return batch * (len(stamps) - 1) / (stamps[-1] - stamps[0])
-
-
-def write_entry(entry: dict[str, object], path: Path) -> None:
-    """Add an entry to the list in a JSON file, which is created if it does not exist."""
-    path.write_text(json.dumps([*read_runs(path), entry], indent=1) + "\n", encoding="utf-8")
 
 
 def read_runs(path: Path) -> list[object]:

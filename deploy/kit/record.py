@@ -4,6 +4,7 @@ an ML-BOM.
 
 import hashlib
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from uuid import NAMESPACE_URL, uuid5
@@ -100,8 +101,11 @@ def record_of(
     about = metadata(network.model)
     weights = _verified_weights(network, sensor, floating)
     in_range = None
-    if weights and _has_family(network):
-        in_range = {key: list(ends) for key, ends in RANGES.items()}
+    if weights:
+        # A damaged file cannot be conditioned on other sensors.
+        with suppress(ModelError):
+            if conditioned_core(network.model) is not None:
+                in_range = {key: list(ends) for key, ends in RANGES.items()}
     return {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
@@ -116,14 +120,6 @@ def record_of(
         "passed": bool(judged),
         "results": judged.to_dict(),
     }
-
-
-def _has_family(network: Network) -> bool:
-    """Return True if the file can be conditioned on other sensors. A damaged file cannot."""
-    try:
-        return conditioned_core(network.model) is not None
-    except ModelError:
-        return False
 
 
 def code_sha256() -> str:

@@ -233,7 +233,13 @@ def _table(
     rows = list(chain.from_iterable(part for _, part in tables))
     headings = {part[0].table: title for title, part in tables if part}
     first = rows[0].table
-    headings[first] = ". ".join([headings[first], *poor_words(boards)])
+    errors = {dpu.target.name: dpu.value("cost", "error_left_out") for dpu in boards}
+    # Such a board's cost model is fitted to few published rates.
+    headings[first] += "".join(
+        f". Of {name} little is known: networks left out of the fit are off by {error:.0%}"
+        for name, error in errors.items()
+        if error > POOR
+    )
     return Bench(
         inputs=(network.input,),
         rows=tuple(rows),
@@ -246,18 +252,6 @@ def _table(
 
 POOR = 0.15
 """Mean error of networks left out of a board's fit from which the first line of a table warns."""
-
-
-def poor_words(boards: Sequence[Dpu]) -> list[str]:
-    """Return a sentence for each board whose cost model is imprecise, because it is fitted to few
-    published rates. A table's heading ends with them.
-    """
-    errors = {dpu.target.name: dpu.value("cost", "error_left_out") for dpu in boards}
-    return [
-        f"Of {name} little is known: networks left out of the fit are off by {error:.0%}"
-        for name, error in errors.items()
-        if error > POOR
-    ]
 
 
 def fitted_words(rows: Sequence[Row]) -> list[str]:

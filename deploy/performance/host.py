@@ -90,14 +90,6 @@ def _row(run: Timed, tile_px: int, conditions: Mapping[str, Figure]) -> Row:
     return Row("host", f"{run.name}, {tile_px} x {tile_px}", {**figures, **conditions})
 
 
-def _ratio_row(runs: Sequence[Timed]) -> Row:
-    # False sorts before True: the INT8 network comes last.
-    float32, int8 = sorted(runs, key=lambda run: is_quantized(run.model))
-    ratio = statistics.median(float32.times_s) / statistics.median(int8.times_s)
-    source = f"medians of {len(int8.times_s)} runs each, interleaved"
-    return Row("host", "float32 time / INT8 time, here", {"ratio": measured(ratio, "x", source)})
-
-
 def _mean_power(run: Timed) -> Figure:
     """Return the mean power over the network's own runs, or the figure that is unavailable."""
     # Runs differ in length: the mean power is energy over time, not the mean of the powers.
@@ -149,7 +141,13 @@ def host_rows(
     rows = [_row(run, tile_px, conditions) for run in runs]
     if sensor is not None:
         rows.append(step_row(sensor, tile_px, min_time_s, min_runs))
-    return rows if other is None else [*rows, _ratio_row(runs)]
+    if other is not None:
+        # False sorts before True: the INT8 network comes last.
+        float32, int8 = sorted(runs, key=lambda run: is_quantized(run.model))
+        ratio = statistics.median(float32.times_s) / statistics.median(int8.times_s)
+        figure = measured(ratio, "x", f"medians of {len(int8.times_s)} runs each, interleaved")
+        rows.append(Row("host", "float32 time / INT8 time, here", {"ratio": figure}))
+    return rows
 
 
 def step_row(sensor: Sensor, tile_px: int, min_time_s: float, min_runs: int) -> Row:

@@ -25,6 +25,10 @@ COST_SOURCE = "cost model fitted on published networks, docs/explanation/cost-mo
 HELD = 0.9
 """Share of families left out of the fit that an interval is meant to hold."""
 ARITHMETIC = "arithmetic of the tile grid"
+STEP_SOURCE = (
+    "counted work of the step at the rates of the board's processor, from the best published to "
+    "plain code"
+)
 PAPER_SIZE = "13600x9016"
 
 
@@ -147,7 +151,13 @@ def swath_figures(
         "efficiency": efficiency(swath.pixels, latency, power),
     }
     if swath.consistency:
-        figures["consistency step"] = step_time(prediction, swath)
+        # All cores of the processor compute the step while the DPU works, so the latency does not
+        # grow by the whole of this time.
+        runs = swath.tiles * swath.runs
+        low_s, high_s = (end_s * runs for end_s in prediction.step_s)
+        figures["consistency step"] = predicted(
+            between((low_s, high_s)), "s", (low_s, high_s), STEP_SOURCE
+        )
     # How many times as fast as the shipped model states the owner's runs make the prediction.
     if prediction.dpu.runs:
         figures["your runs"] = exact(prediction.speed, "x", "your runs, weighed by kinship")
@@ -157,21 +167,6 @@ def swath_figures(
 def throughput(prediction: Prediction) -> Figure:
     """Return the predicted rate of the DPU and the host together, in tiles per second."""
     return predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE)
-
-
-def step_time(prediction: Prediction, swath: Swath) -> Figure:
-    """Return the time of the consistency step for the whole swath, in s.
-
-    All cores of the board's processor compute the step while the DPU works, so the latency of the
-    swath does not grow by the whole of this time.
-    """
-    runs = swath.tiles * swath.runs
-    low_s, high_s = (end_s * runs for end_s in prediction.step_s)
-    source = (
-        "counted work of the step at the rates of the board's processor, from the best "
-        "published to plain code"
-    )
-    return predicted(between((low_s, high_s)), "s", (low_s, high_s), source)
 
 
 def host_time(prediction: Prediction, unit: str) -> Figure:

@@ -216,24 +216,19 @@ def sweep_rows(
     for dpu, tile_px in product(boards, tiles_px):
         tiled = replace(swath, tile_px=tile_px)
         prediction = predict_network(network, dpu, tile_px, task, tiled.step_px)
-        rows.append(swath_row(prediction, tiled))
+        batches = math.ceil(tiled.tiles * tiled.runs / prediction.batch)
+        on_chip = [not layer.work.map_bytes for layer in prediction.layers]
+        figures = swath_figures(prediction, tiled, tiled.tiles, batches) | {
+            "maps through memory": exact(prediction.streamed_bytes / 1e6, "MB/tile"),
+            "layers on chip": exact(100 * sum(on_chip) / len(on_chip), "%"),
+        }
+        bound = Counter[str]()
+        for layer in prediction.layers:
+            # A Counter is typed to hold integers: the times are added up in picoseconds.
+            bound[layer.bound] += round(1e12 * layer.time_s)
+        words = {"bound": bound.most_common(1)[0][0], "fitted range": fitted_range(prediction)}
+        rows.append(Row("sweep", f"{named(dpu)}, tiles of {tile_px}", figures, words))
     return rows
-
-
-def swath_row(prediction: Prediction, swath: Swath) -> Row:
-    """Return the predicted figures of a swath, in whole tiles, as one row of a sweep."""
-    batches = math.ceil(swath.tiles * swath.runs / prediction.batch)
-    on_chip = [not layer.work.map_bytes for layer in prediction.layers]
-    figures = swath_figures(prediction, swath, swath.tiles, batches) | {
-        "maps through memory": exact(prediction.streamed_bytes / 1e6, "MB/tile"),
-        "layers on chip": exact(100 * sum(on_chip) / len(on_chip), "%"),
-    }
-    bound = Counter[str]()
-    for layer in prediction.layers:
-        # A Counter is typed to hold integers: the times are added up in picoseconds.
-        bound[layer.bound] += round(1e12 * layer.time_s)
-    words = {"bound": bound.most_common(1)[0][0], "fitted range": fitted_range(prediction)}
-    return Row("sweep", f"{named(prediction.dpu)}, tiles of {swath.tile_px}", figures, words)
 
 
 def named(dpu: Dpu) -> str:

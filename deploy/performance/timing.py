@@ -32,26 +32,19 @@ def timed(work: Callable[[], Result], powercap: Path = POWERCAP) -> tuple[Result
     start = time.perf_counter()
     result = work()
     elapsed_s = time.perf_counter() - start
-    return result, elapsed_s, _power(before, _read(powercap), elapsed_s)
-
-
-def _power(before: dict[Path, int] | str, after: dict[Path, int] | str, elapsed_s: float) -> Figure:
+    after = _read(powercap)
     if isinstance(before, str):
-        return unavailable("W", before)
+        return result, elapsed_s, unavailable("W", before)
     if isinstance(after, str):
-        return unavailable("W", after)
-    energy_uj = sum(_advance(domain, before[domain], after[domain]) for domain in before)
-    return measured(energy_uj / 1e6 / elapsed_s, "W", "RAPL package counters over the same window")
-
-
-def _advance(domain: Path, before: int, after: int) -> int:
-    """Return the difference of two readings of a counter, which may have started again once at its
-    range.
-    """
-    if after >= before:
-        return after - before
-    range_uj = int((domain / "max_energy_range_uj").read_text(encoding="utf-8"))
-    return after - before + range_uj
+        return result, elapsed_s, unavailable("W", after)
+    energy_uj = 0
+    for domain, first_uj in before.items():
+        energy_uj += after[domain] - first_uj
+        # A counter starts again at its range.
+        if after[domain] < first_uj:
+            energy_uj += int((domain / "max_energy_range_uj").read_text(encoding="utf-8"))
+    source = "RAPL package counters over the same window"
+    return result, elapsed_s, measured(energy_uj / 1e6 / elapsed_s, "W", source)
 
 
 def _read(powercap: Path) -> dict[Path, int] | str:

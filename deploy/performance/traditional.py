@@ -3,7 +3,6 @@ pixel.
 """
 
 import statistics
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -76,7 +75,16 @@ def measure_pipeline(dn: np.ndarray, degraded: Sensor, reference: Sensor) -> Pip
         reference: the better sensor that is the target of the deconvolution.
     """
     pipeline = TraditionalPipeline(degraded.nominal(), reference.nominal())
-    crops = [torch.from_numpy(np.ascontiguousarray(crop, dtype=np.float32)) for crop in _crops(dn)]
+    height, width = (min(CROP_PX, side) for side in dn.shape)
+    crops = []
+    # Square crops along the image's diagonal, or the image if it is not larger.
+    for k in range(CROPS):
+        top, left = (
+            (side - crop) * k // (CROPS - 1)
+            for side, crop in zip(dn.shape, (height, width), strict=True)
+        )
+        crop = np.ascontiguousarray(dn[top : top + height, left : left + width], np.float32)
+        crops.append(torch.from_numpy(crop))
     restore_traditional(crops[0][:32, :32], pipeline)
     # The load is measured from one call to the next: this one opens the window of the timed run.
     cpu_load()
@@ -85,7 +93,6 @@ def measure_pipeline(dn: np.ndarray, degraded: Sensor, reference: Sensor) -> Pip
         lambda: [timed(partial(restore_traditional, crop, pipeline))[1] for crop in crops]
     )
     per_mpx = [1e6 * time_s / crop.numel() for time_s, crop in zip(times_s, crops, strict=True)]
-    height, width = crops[0].shape
     own_s = own_cpu_s() - before_s
     conditions = conditions_of(torch.get_num_threads())
     others = load_of_others(conditions["CPU load"], own_s, elapsed_s)
@@ -114,14 +121,3 @@ def drawn_acquisition(
     scene = procedural_scene(height, width, np.random.default_rng(seed))
     pair = simulate_pair(scene.radiance, degraded.nominal(), reference.nominal(), ratio, Draw(seed))
     return pair.degraded
-
-
-def _crops(dn: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield square crops along the image's diagonal, or the image if it is not larger."""
-    height, width = (min(CROP_PX, side) for side in dn.shape)
-    for k in range(CROPS):
-        top, left = (
-            (side - crop) * k // (CROPS - 1)
-            for side, crop in zip(dn.shape, (height, width), strict=True)
-        )
-        yield dn[top : top + height, left : left + width]

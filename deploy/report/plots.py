@@ -191,7 +191,15 @@ def svg_of(figure: "Figure", name: str) -> Markup:
         "aria-label": visible(name),
     }
     style = ET.Element(f"{{{SVG}}}style")
-    style.text = plot_style()
+    # The variables of the colours, for light and for dark screens.
+    light, dark = (
+        " ".join(f"--{name}: {colour};" for name, colour in colours.items())
+        for colours in (LIGHT, DARK)
+    )
+    style.text = (
+        f":root {{ {light} }}\n@media screen and (prefers-color-scheme: dark) {{ :root {{ "
+        f"{dark} }} }}\n"
+    )
     root.insert(0, style)
     for group in root.iter(f"{{{SVG}}}g"):
         # A group id that `Artist.set_gid` set becomes a class. Those of matplotlib contain "_".
@@ -199,18 +207,6 @@ def svg_of(figure: "Figure", name: str) -> Markup:
         if "_" not in kind:
             group.set("class", kind)
     return Markup(ET.tostring(root, encoding="unicode"))  # noqa: S704 - ElementTree escapes
-
-
-def plot_style() -> str:
-    """Return the CSS that sets the colour variables of the plots for light and dark screens."""
-    light, dark = (
-        " ".join(f"--{name}: {colour};" for name, colour in colours.items())
-        for colours in (LIGHT, DARK)
-    )
-    return (
-        f":root {{ {light} }}\n@media screen and (prefers-color-scheme: dark) {{ :root {{ "
-        f"{dark} }} }}\n"
-    )
 
 
 def data_url(svg: str) -> str:

@@ -90,14 +90,12 @@ def _tiles(level: Image.Image) -> list[list[str]]:
         row = []
         for left in range(0, width, TILE_PX):
             right = min(left + TILE_PX, width)
-            row.append(_address(level.crop((left, top, right, bottom))))
+            buffer = io.BytesIO()
+            # JPEG has no opacity.
+            kind = "png" if level.mode == "RGBA" else "jpeg"
+            tile = level.crop((left, top, right, bottom))
+            tile.save(buffer, kind, quality=QUALITY, subsampling=0)
+            content = base64.b64encode(buffer.getvalue()).decode()
+            row.append(f"data:image/{kind};base64,{content}")
         rows.append(row)
     return rows
-
-
-def _address(tile: Image.Image) -> str:
-    """Return a tile as a data: address: PNG with opacity, else JPEG."""
-    buffer = io.BytesIO()
-    kind = "png" if tile.mode == "RGBA" else "jpeg"
-    tile.save(buffer, kind, quality=QUALITY, subsampling=0)
-    return f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode()}"

@@ -128,22 +128,21 @@ def judge(op: Operation, dpu: Dpu, quantized: bool) -> tuple[Broken, ...]:
     Returns:
         The rules that the operation breaks as it is written; empty if it passes.
     """
-    breaches = [_broken(form, dpu, quantized) for form in forms(op, dpu)]
+    breaches = []
+    for form in forms(op, dpu):
+        rules = RULES[form.kind] + EVERY
+        # The results of these two kinds are no numbers of 8 bits.
+        if quantized and form.kind not in ("other", "argmax"):
+            rules += NUMBERS + SHIFTS.get(form.kind, ())
+        findings = ((rule, rule(form, dpu)) for rule in rules if applies(rule, dpu))
+        broken = (
+            Broken(rule_name(rule), rule_text(rule, dpu), finding)
+            for rule, finding in findings
+            if finding
+        )
+        breaches.append(tuple(broken))
     # The first form is the operation as the file has it: the report is about that one.
     return breaches[0] if all(breaches) else ()
-
-
-def _broken(op: Operation, dpu: Dpu, quantized: bool) -> tuple[Broken, ...]:
-    rules = RULES[op.kind] + EVERY
-    # The results of these two kinds are no numbers of 8 bits.
-    if quantized and op.kind not in ("other", "argmax"):
-        rules += NUMBERS + SHIFTS.get(op.kind, ())
-    findings = ((rule, rule(op, dpu)) for rule in rules if applies(rule, dpu))
-    return tuple(
-        Broken(rule_name(rule), rule_text(rule, dpu), finding)
-        for rule, finding in findings
-        if finding
-    )
 
 
 def forms(op: Operation, dpu: Dpu) -> Iterator[Operation]:

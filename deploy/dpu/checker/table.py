@@ -5,15 +5,14 @@ then follows from that table: it was not verified with the compiler.
 """
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import onnx
 
 from beers_deploy.dpu.board import Dpu, device_of
 from beers_deploy.dpu.checker.finding import Finding
-from beers_deploy.dpu.checker.placement import Cut, PlacedNode, Placement, place
+from beers_deploy.dpu.checker.placement import PlacedNode, Placement, place
 from beers_deploy.dpu.checker.remarks import is_island, remarks_on
-from beers_deploy.dpu.graph import SizedGraph
 from beers_deploy.dpu.reading import network_of, usual_tile_px
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike
@@ -109,7 +108,10 @@ def check_network(
     placement = place(sized, build)
     npu = bool(target.npu)
     checks = [legality(placement, npu=npu), *(_file_checks(source.model, build) if npu else [])]
-    if not is_quantized(source.model) and _makes_image(sized):
+    results = [op.out_shape for op in sized.operations if op.output in sized.outputs]
+    # A result of unknown shape may be an image.
+    makes_image = bool(results) and all(shape is None or min(shape[1:]) > 1 for shape in results)
+    if makes_image and not is_quantized(source.model):
         reason = _refusal(source.model)
         checks.append(Check(ACCEPTED, int(bool(reason)), 0, "network", detail=reason))
     # A quantised file whose numbers nobody reads here is placed as if it were in float.
@@ -145,12 +147,6 @@ DETAILS = frozenset({"nodes", "subgraphs", "summary"})
 ACCEPTED = "networks that 'quantize' refuses"
 
 
-def _makes_image(network: SizedGraph) -> bool:
-    """Return True if all results of a network are images. One of unknown shape may be one."""
-    results = [op.out_shape for op in network.operations if op.output in network.outputs]
-    return bool(results) and all(shape is None or min(shape[1:]) > 1 for shape in results)
-
-
 def _refusal(model: onnx.ModelProto) -> str:
     """Return why `quantize` refuses a float network or its input; "" if it accepts both."""
     # First, because a file that is refused may have weights among its inputs.
@@ -177,7 +173,14 @@ def _rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:
         return [*nodes, *remarks, Row("summary", "placement", refusals)]
     parts = {"DPU subgraphs": _count(placement.dpu_subgraphs, "subgraph")}
     summary = Row("summary", "placement", parts | refusals)
-    return [*nodes, *_subgraph_rows(placement), *map(_cut_row, placement.cuts), *remarks, summary]
+    cuts = []
+    for cut in placement.cuts:
+        size = unavailable("byte/image", "its shape is unknown")
+        if cut.size_bytes is not None:
+            size = _count(cut.size_bytes, "byte/image")
+        words = {"direction": "onto the DPU" if cut.onto_dpu else "off the DPU"}
+        cuts.append(Row("cuts", cut.tensor, {"size": size}, words))
+    return [*nodes, *_subgraph_rows(placement), *cuts, *remarks, summary]
 
 
 def legality(placement: Placement, *, npu: bool = False) -> Check:
@@ -265,8 +268,7 @@ def _node_rows(node: PlacedNode, placement: Placement, dpu: Dpu) -> list[Row]:
         return [Row("nodes", node.op.name, {}, words)]
     rows = []
     for breach in node.broken:
-        finding = breach.finding
-        why = {"rule": breach.text, "reason": finding.reason, "remedy": finding.remedy}
+        why = {"rule": breach.text, **asdict(breach.finding)}
         rows.append(Row("nodes", node.op.name, {}, words | why))
     return rows
 
@@ -298,14 +300,6 @@ def _subgraph_rows(placement: Placement) -> list[Row]:
         figures = {"nodes": _count(len(members), "node")}
         rows.append(Row("subgraphs", f"subgraph {number}", figures, words))
     return rows
-
-
-def _cut_row(cut: Cut) -> Row:
-    size = unavailable("byte/image", "its shape is unknown")
-    if cut.size_bytes is not None:
-        size = _count(cut.size_bytes, "byte/image")
-    words = {"direction": "onto the DPU" if cut.onto_dpu else "off the DPU"}
-    return Row("cuts", cut.tensor, {"size": size}, words)
 
 
 def _count(value: int, unit: str) -> Figure:

@@ -85,23 +85,7 @@ def placed_work(placement: Placement, task: Task) -> Array:
     Returns:
         An array (7,) as `host_work` returns it.
     """
-    onto, back = _crossing_bytes(placement)
-    return host_work(onto, back, back * (_scores(placement) if task == "sort" else 1), task)
-
-
-BOXES = 3
-LEAST = 6
-"""Boxes that a pixel of YOLO's maps has in versions 2 to 7, and the least numbers of a box: its
-place and size, a score, and a class.
-"""
-
-
-def _scores(placement: Placement) -> float:
-    """Return the share of the results that a sort reads.
-
-    The host skips a box whose score is low. A network is taken for YOLO if all its results have the
-    same number of channels, a multiple of BOXES. All results of other networks are read.
-    """
+    onto_bytes, back_bytes = _crossing_bytes(placement)
     back = {cut.tensor for cut in placement.cuts if not cut.onto_dpu}
     channels = {
         node.op.out_shape[0]
@@ -110,7 +94,19 @@ def _scores(placement: Placement) -> float:
     }
     # Of maps with different numbers of channels all is read, as of one whose number is 1.
     count = channels.pop() if len(channels) == 1 else 1
-    return BOXES / count if count % BOXES == 0 and count >= LEAST * BOXES else 1.0
+    values: float = back_bytes
+    # The host skips a box whose score is low. A network is taken for YOLO if all its results have
+    # the same number of channels, a multiple of BOXES.
+    if task == "sort" and count % BOXES == 0 and count >= LEAST * BOXES:
+        values *= BOXES / count
+    return host_work(onto_bytes, back_bytes, values, task)
+
+
+BOXES = 3
+LEAST = 6
+"""Boxes that a pixel of YOLO's maps has in versions 2 to 7, and the least numbers of a box: its
+place and size, a score, and a class.
+"""
 
 
 def task_of(placement: Placement) -> Task:
@@ -123,22 +119,19 @@ def task_of(placement: Placement) -> Task:
     for node in placement.nodes:
         if node.part == "host-back" and node.op.op_type in OPERATORS:
             return OPERATORS[node.op.op_type]
+    read_names = set(chain.from_iterable(node.op.inputs for node in placement.nodes))
+    shapes = [
+        node.op.out_shape for node in placement.nodes if read_names.isdisjoint(node.op.outputs)
+    ]
+    is_image = len(shapes) == 1 and shapes[0] is not None and shapes[0][0] <= BANDS
     onto, back = _crossing_bytes(placement)
-    return "image" if back >= onto and _gives_an_image(placement) else "copy"
+    return "image" if back >= onto and is_image else "copy"
 
 
 def _crossing_bytes(placement: Placement) -> tuple[int, int]:
     """Return the bytes of one image that the host sends to the DPU, and those that it receives."""
     onto = sum(cut.size_bytes or 0 for cut in placement.cuts if cut.onto_dpu)
     return onto, sum(cut.size_bytes or 0 for cut in placement.cuts if not cut.onto_dpu)
-
-
-def _gives_an_image(placement: Placement) -> bool:
-    read_names = set(chain.from_iterable(node.op.inputs for node in placement.nodes))
-    shapes = [
-        node.op.out_shape for node in placement.nodes if read_names.isdisjoint(node.op.outputs)
-    ]
-    return len(shapes) == 1 and shapes[0] is not None and shapes[0][0] <= BANDS
 
 
 FLOAT_BYTES = 4

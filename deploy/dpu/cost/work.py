@@ -132,21 +132,15 @@ def _array_operations(op: Operation, dpu: Dpu) -> int:
         dpu.whole("array", "pixel_parallel"),
         dpu.whole("array", "column_parallel"),
     )
-    inputs = math.prod(strides) * rows * _row_inputs(op.channels[0], columns, dpu)
-    return 2 * inputs * _up(channels, dpu.output_parallel) * pixels
-
-
-def _row_inputs(channels: int, columns: int, dpu: Dpu) -> int:
-    """Return the number of inputs that the array reads for one row of a window, used or not.
-
-    Where there are few channels, several columns of the window are taken in side by side (channel
-    augmentation).
-    """
-    # With few input channels the array takes in several columns of the window side by side.
-    together = min(max(AUGMENTATION * dpu.input_parallel // channels, 1), columns)
+    # With few input channels the array takes in several columns of the window side by side
+    # (channel augmentation).
+    read = op.channels[0]
+    together = min(max(AUGMENTATION * dpu.input_parallel // read, 1), columns)
     full, rest = divmod(columns, together)
     lanes = dpu.input_parallel * dpu.whole("array", "input_groups")
-    return full * _up(together * channels, lanes) + _up(rest * channels, lanes)
+    row_inputs = full * _up(together * read, lanes) + _up(rest * read, lanes)
+    inputs = math.prod(strides) * rows * row_inputs
+    return 2 * inputs * _up(channels, dpu.output_parallel) * pixels
 
 
 def _lane_steps(op: Operation, dpu: Dpu) -> int:
