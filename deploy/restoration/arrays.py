@@ -157,21 +157,15 @@ def _labelled(image: Any, pixels: Any) -> Any:
         # This transform is that of the original pixels; the coordinates have the new places.
         coordinate.attrs.pop("GeoTransform", None)
     for dim in changed.intersection(image.dims[-2:], image.coords):
-        places = _between(image.coords[dim].values, sizes[dim])
-        coordinates |= {dim: (dim, places, image.coords[dim].attrs)} if places is not None else {}
+        places = image.coords[dim].values
+        if len(places) < 2 or places.dtype.kind not in "iuf":
+            continue
+        # Pixels of both sizes share the image's borders, not their middles.
+        at = (np.arange(sizes[dim]) + 0.5) * (len(places) / sizes[dim]) - 0.5
+        left = np.clip(np.floor(at).astype(int), 0, len(places) - 2)
+        between = places[left] + (at - left) * (places[left + 1] - places[left])
+        coordinates[dim] = (dim, between, image.coords[dim].attrs)
     return type(image)(pixels, coordinates, dims, image.name, image.attrs)
-
-
-def _between(places: np.ndarray, count: int) -> np.ndarray | None:
-    """Return the centres of `count` evenly spaced pixels over those at `places`, or None if these
-    are not at least two numbers.
-    """
-    if len(places) < 2 or places.dtype.kind not in "iuf":
-        return None
-    # Pixels of both sizes share the image's borders, not their middles.
-    at = (np.arange(count) + 0.5) * (len(places) / count) - 0.5
-    left = np.clip(np.floor(at).astype(int), 0, len(places) - 2)
-    return np.asarray(places[left] + (at - left) * (places[left + 1] - places[left]))
 
 
 def _restore_now(

@@ -6,7 +6,7 @@ the end of their names, or used in the order given.
 
 import logging
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -136,7 +136,10 @@ def in_order(items: Mapping[str, Each], raster: Raster) -> list[Each]:
     if "" in items:
         return [items[""]]
     stored_names = raster.band_names
-    names = stored_names or _by_number(items)
+    names: Iterable[str] = stored_names or items
+    # Names that end in a number, such as B2, are sorted by it.
+    if not stored_names and all(re.fullmatch(r"\D*\d{1,6}", name) for name in items):
+        names = sorted(items, key=lambda name: int(re.sub(r"\D", "", name)))
     if len(items) != raster.bands or set(names) != set(items):
         names_text = f" ({printable(', '.join(stored_names))})" if stored_names else ""
         raise OptionError(
@@ -165,15 +168,6 @@ def by_band(
     """
     built = tuple(build(sensor) for sensor in in_order(sensors, raster))
     return built * (raster.bands // len(built))
-
-
-def _by_number(names: Collection[str]) -> Collection[str]:
-    """Sort names that end in a number, such as B2, by that number. Leave other names in the given
-    order.
-    """
-    if all(re.fullmatch(r"\D*\d{1,6}", name) for name in names):
-        return sorted(names, key=lambda name: int(re.sub(r"\D", "", name)))
-    return names
 
 
 def require_alike(networks: Sequence[Network]) -> None:

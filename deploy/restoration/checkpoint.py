@@ -163,7 +163,14 @@ class Checkpoint:
             self._finished.append(FinishedRow(rows_px, digest.hexdigest(), row.tally))
             self.rows += rows_px
             self.tally += row.tally
-            self._write_journal()
+            fresh = self.folder / "journal.new"
+            with fresh.open("w", encoding="utf-8") as journal:
+                journal.write(journal_text(self.job, self._finished))
+                journal.flush()
+                os.fsync(journal.fileno())
+            # A run that is killed here leaves the old journal or the new one, never half of one.
+            fresh.replace(self.folder / "journal.json")
+            sync_folder(self.folder)
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
         """Read finished rows `start` to `stop` (excluded) of one band from the disk.
@@ -232,33 +239,16 @@ class Checkpoint:
         matching = list[FinishedRow]()
         top = 0
         for row in finished:
-            if self._stored_sha256(top, row.rows_px) != row.sha256:
+            digest = hashlib.sha256()
+            with suppress(OSError), (self.folder / "rows.raw").open("rb") as stream:
+                for band in range(self.shape[0]):
+                    stream.seek(self._offset(band, top))
+                    digest.update(stream.read(row.rows_px * self.shape[2] * self.dtype.itemsize))
+            if digest.hexdigest() != row.sha256:
                 break
             matching.append(row)
             top += row.rows_px
         return matching
-
-    def _stored_sha256(self, top: int, rows_px: int) -> str:
-        """Return the digest of `rows_px` stored rows from row `top` on, or of as many of them as
-        the file has.
-        """
-        digest = hashlib.sha256()
-        with suppress(OSError), (self.folder / "rows.raw").open("rb") as stream:
-            for band in range(self.shape[0]):
-                stream.seek(self._offset(band, top))
-                digest.update(stream.read(rows_px * self.shape[2] * self.dtype.itemsize))
-        return digest.hexdigest()
-
-    def _write_journal(self) -> None:
-        path = self.folder / "journal.json"
-        fresh = self.folder / "journal.new"
-        with fresh.open("w", encoding="utf-8") as stream:
-            stream.write(journal_text(self.job, self._finished))
-            stream.flush()
-            os.fsync(stream.fileno())
-        # A run that is killed here leaves the old journal or the new one, never half of one.
-        fresh.replace(path)
-        sync_folder(self.folder)
 
     def _offset(self, band: int, row: int) -> int:
         return (band * self.shape[1] + row) * self.shape[2] * self.dtype.itemsize

@@ -128,7 +128,15 @@ class Tally:
             before = stored[valid]
             after = restored[valid_restored]
         ends = int(at_ends.sum())
-        blank = 0 if valid is not None else _blank_px(stored)
+        blank = 0
+        if valid is None:
+            # Whole squares of `BLANK_PX` that are 0.
+            bands, height, width = stored.shape
+            rows = height // BLANK_PX
+            columns = width // BLANK_PX
+            whole = stored[:, : rows * BLANK_PX, : columns * BLANK_PX]
+            squares = whole.reshape(bands, rows, BLANK_PX, columns, BLANK_PX)
+            blank = int((squares == 0).all(axis=(2, 4)).sum()) * BLANK_PX**2
         counts = cls(after.size, int((before > 1).sum()), ends, network_at_ends=ends, blank=blank)
         if not alike:
             return counts
@@ -309,13 +317,3 @@ class Tally:
                 f"{printable('; '.join(self.doubts))}. Check `full_scale`, check the network with "
                 "'gate', or write the result all the same with `force`."
             )
-
-
-def _blank_px(stored: np.ndarray) -> int:
-    """Return the number of pixels (bands, h, w) in whole squares of `BLANK_PX` that are 0."""
-    bands, height, width = stored.shape
-    rows = height // BLANK_PX
-    columns = width // BLANK_PX
-    whole = stored[:, : rows * BLANK_PX, : columns * BLANK_PX]
-    squares = whole.reshape(bands, rows, BLANK_PX, columns, BLANK_PX)
-    return int((squares == 0).all(axis=(2, 4)).sum()) * BLANK_PX**2

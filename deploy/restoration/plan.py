@@ -7,7 +7,6 @@ network's receptive radius, the result is the same as for the whole image, bit f
 is extended there by copies of its last row and column.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
@@ -123,7 +122,17 @@ def plan_side(
     # The strides of a network sample other pixels in a tile that begins or ends off the lattice.
     extended_px = _up(max(size_px, min_side_px), alignment_px)
     side_px = min(tile_px // alignment_px * alignment_px, extended_px)
-    return list(_spans(size_px, extended_px, side_px, halo_px))
+    spans = []
+    done = 0
+    # All spans have the same length, so the last one is moved inward instead of cut. Spans are read
+    # from the image and its extension, but their retained parts end with the image.
+    while done < size_px:
+        start = min(max(done - halo_px, 0), extended_px - side_px)
+        stop = start + side_px
+        keep_stop = size_px if stop == extended_px else stop - halo_px
+        spans.append(Span(start, stop, done, keep_stop))
+        done = keep_stop
+    return spans
 
 
 def _up(size_px: int, alignment_px: int) -> int:
@@ -147,20 +156,6 @@ def even_side_px(size_px: int, tile_px: int, halo_px: int, alignment_px: int = 1
     count = len(plan_side(size_px, tile_px, halo_px, alignment_px))
     even_px = -(-(_up(size_px, alignment_px) + 2 * halo_px * (count - 1)) // count)
     return max(_up(even_px, alignment_px), 2 * halo_px + alignment_px)
-
-
-def _spans(image_px: int, size_px: int, tile_px: int, halo_px: int) -> Iterator[Span]:
-    """Yield the spans of one side. They are read from `size_px` pixels, the image and its
-    extension, but their retained parts end with the image, after `image_px` pixels.
-    """
-    done = 0
-    # All spans have the same length, so the last one is moved inward instead of cut.
-    while done < image_px:
-        start = min(max(done - halo_px, 0), size_px - tile_px)
-        stop = start + tile_px
-        keep_stop = image_px if stop == size_px else stop - halo_px
-        yield Span(start, stop, done, keep_stop)
-        done = keep_stop
 
 
 @dataclass(frozen=True)
@@ -336,26 +331,6 @@ def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, tiling: Tiling
         ModelError: the network returns an image whose size is no multiple of the image's.
     """
     bands, height_px, width_px = shape
-    _require_fit(bands, halo_px, tiling)
-
-    def side(size_px: int) -> tuple[Span, ...]:
-        alignment_px = tiling.alignment_px
-        longest_px = (
-            even_side_px(size_px, tile_px, halo_px, alignment_px)
-            if tiling.fixed_px is None
-            else tile_px
-        )
-        return tuple(plan_side(size_px, longest_px, halo_px, alignment_px, tiling.min_side_px))
-
-    return Plan(
-        bands, height_px, width_px, tile_px, halo_px, tiling, side(height_px), side(width_px)
-    )
-
-
-def _require_fit(bands: int, halo_px: int, tiling: Tiling) -> None:
-    """Raise an error if a network cannot restore an image of this number of bands, or with this
-    halo.
-    """
     if tiling.scale.denominator != 1:
         raise ModelError(
             "The network's result must have the size of the image or a multiple of it, but it has "
@@ -372,3 +347,16 @@ def _require_fit(bands: int, halo_px: int, tiling: Tiling) -> None:
             f"the network repeat, got {halo_px} px. A halo of {tiling.halo_px} px is exact for "
             "this network."
         )
+
+    def side(size_px: int) -> tuple[Span, ...]:
+        alignment_px = tiling.alignment_px
+        longest_px = (
+            even_side_px(size_px, tile_px, halo_px, alignment_px)
+            if tiling.fixed_px is None
+            else tile_px
+        )
+        return tuple(plan_side(size_px, longest_px, halo_px, alignment_px, tiling.min_side_px))
+
+    return Plan(
+        bands, height_px, width_px, tile_px, halo_px, tiling, side(height_px), side(width_px)
+    )

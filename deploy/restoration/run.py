@@ -8,8 +8,8 @@ the new one. Finished rows stay in the checkpoint if a later run can continue fr
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -44,7 +44,6 @@ from beers_deploy.restoration.output import Output, require_tiff_name, what_was_
 from beers_deploy.restoration.prepare import Pipeline, Restoration
 from beers_deploy.restoration.radiometry import Reading
 from beers_deploy.restoration.self_check import check_result, checks_of, write_map
-from beers_deploy.restoration.tiles.rows import RestoredRow
 from beers_deploy.results import Input, Table
 
 logger = logging.getLogger(__name__)
@@ -291,8 +290,16 @@ def _finish_rows(checkpoint: Checkpoint, work: Restoration) -> None:
                 raise KeyboardInterrupt
 
         # A generator that is closed cancels the tiles that still wait.
-        with closing(work.rows(checkpoint.rows, tick)) as finished:
-            _write_behind(finished, checkpoint)
+        with (
+            closing(work.rows(checkpoint.rows, tick)) as finished,
+            ThreadPoolExecutor(1) as writer,
+        ):
+            writing = writer.submit(lambda: None)
+            for row in finished:
+                # The result raises an error of the writer, and no more than one row ever waits.
+                writing.result()
+                writing = writer.submit(checkpoint.append, row)
+            writing.result()
         if not checkpoint.tally.valid_results:
             raise ImageError(
                 f"{work.name} has no pixels with values, only NaN or nodata. Check that it is the "
@@ -326,19 +333,6 @@ def _rows_for_resuming(checkpoint: Checkpoint, resumable: bool) -> Iterator[None
         if is_refused or not resumable:
             checkpoint.remove()
         raise
-
-
-def _write_behind(restored: Iterable[RestoredRow], checkpoint: Checkpoint) -> None:
-    """Store each row while the next is computed. At most one row waits."""
-    with ThreadPoolExecutor(1) as writer:
-        writing: Future[None] | None = None
-        for row in restored:
-            # The result raises an error of the writer, and no more than one row ever waits.
-            if writing is not None:
-                writing.result()
-            writing = writer.submit(checkpoint.append, row)
-        if writing is not None:
-            writing.result()
 
 
 def _warn_of_clipping(work: Restoration, checkpoint: Checkpoint) -> None:

@@ -141,26 +141,29 @@ def saturating_adds(model: onnx.ModelProto) -> onnx.ModelProto:
     expanded.graph.initializer.append(numpy_helper.from_array(np.array(0, np.uint8), LOWEST))
     del expanded.graph.node[:]
     for node in model.graph.node:
-        expanded.graph.node.extend(_written_out(node) if node.op_type == "QLinearAdd" else [node])
+        if node.op_type != "QLinearAdd":
+            expanded.graph.node.append(node)
+            continue
+        name = node.output[0]
+        # Inputs of QLinearAdd: value, scale and zero point of A and of B, then those of the result.
+        for side, (value, *scale) in {"a": node.input[:3], "b": node.input[3:6]}.items():
+            # Max with 0 changes no uint8, but prevents OpenVINO from fusing the convolution into
+            # the add, which would lose the rounding between the two.
+            expanded.graph.node.extend(
+                [
+                    helper.make_node("Max", [value, LOWEST], [f"{name}.{side}"]),
+                    helper.make_node(
+                        "DequantizeLinear", [f"{name}.{side}", *scale], [f"{name}.{side}_real"]
+                    ),
+                ]
+            )
+        expanded.graph.node.extend(
+            [
+                helper.make_node("Add", [f"{name}.a_real", f"{name}.b_real"], [f"{name}.sum"]),
+                helper.make_node("QuantizeLinear", [f"{name}.sum", *node.input[6:8]], [name]),
+            ]
+        )
     return expanded
-
-
-def _written_out(add: onnx.NodeProto) -> list[onnx.NodeProto]:
-    # Inputs of QLinearAdd: value, scale and zero point of A and of B, then those of the result.
-    a, *a_scale = add.input[0:3]
-    b, *b_scale = add.input[3:6]
-    scale = add.input[6:8]
-    name = add.output[0]
-    # Max with 0 changes no uint8, but prevents OpenVINO from fusing the convolution into the add,
-    # which would lose the rounding between the two.
-    return [
-        helper.make_node("Max", [a, LOWEST], [f"{name}.a"]),
-        helper.make_node("Max", [b, LOWEST], [f"{name}.b"]),
-        helper.make_node("DequantizeLinear", [f"{name}.a", *a_scale], [f"{name}.a_real"]),
-        helper.make_node("DequantizeLinear", [f"{name}.b", *b_scale], [f"{name}.b_real"]),
-        helper.make_node("Add", [f"{name}.a_real", f"{name}.b_real"], [f"{name}.sum"]),
-        helper.make_node("QuantizeLinear", [f"{name}.sum", *scale], [name]),
-    ]
 
 
 AT_ONCE = 4

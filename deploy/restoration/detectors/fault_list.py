@@ -147,33 +147,28 @@ def read_list(path: Path, raster: Raster) -> FaultList:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError):
         reason = f"cannot be read: {unreadable(path) or 'it is not a text file'}"
-    faults = [
-        _fault(path, number, line, raster)
-        for number, line in enumerate(lines, 1)
-        if not NO_FAULT.fullmatch(line)
-    ]
+    faults = set[Fault]()
+    for number, line in enumerate(lines, 1):
+        if NO_FAULT.fullmatch(line):
+            continue
+        match = FAULT.fullmatch(line)
+        if match is None:
+            raise OptionError(
+                f"Line {number} of {path} must be column,row or column,row,band, got {line[:40]!r}."
+                " Correct or delete the line."
+            )
+        column, row, band = (-1 if cell == ALL else int(cell or 0) for cell in match.groups())
+        if column >= raster.width_px or row >= raster.height_px or band > raster.bands:
+            raise OptionError(
+                f"Line {number} of {path} ({line.strip()}) lies outside the image, which has "
+                f"{raster.width_px} columns, {raster.height_px} rows and "
+                f"{counted(raster.bands, 'band')}. Count columns and rows from 0, and bands from 1."
+            )
+        faults.add(Fault(column, row, band))
     # A list that a run found empty has its header alone.
     if not faults and not any(HEADER_LINE.fullmatch(line) for line in lines):
         raise OptionError(
             f"`fix_detectors` must be '{FOUND}' or a list of faulty detectors, but {path} {reason}."
             " Write lines 'column,row', counted from 0, with '*' as the row for a whole column."
         )
-    return FaultList(tuple(sorted(set(faults))))
-
-
-def _fault(path: Path, number: int, line: str, raster: Raster) -> Fault:
-    """Return the fault of one line, the `number`-th of the file."""
-    match = FAULT.fullmatch(line)
-    if match is None:
-        raise OptionError(
-            f"Line {number} of {path} must be column,row or column,row,band, got {line[:40]!r}. "
-            "Correct or delete the line."
-        )
-    column, row, band = (-1 if cell == ALL else int(cell or 0) for cell in match.groups())
-    if column >= raster.width_px or row >= raster.height_px or band > raster.bands:
-        raise OptionError(
-            f"Line {number} of {path} ({line.strip()}) lies outside the image, which has "
-            f"{raster.width_px} columns, {raster.height_px} rows and "
-            f"{counted(raster.bands, 'band')}. Count columns and rows from 0, and bands from 1."
-        )
-    return Fault(column, row, band)
+    return FaultList(tuple(sorted(faults)))

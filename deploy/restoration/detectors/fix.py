@@ -6,7 +6,6 @@ is restored. The same command, resumed or not, therefore replaces the same pixel
 """
 
 import logging
-from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 
@@ -150,14 +149,24 @@ def find_faults(source: Source, name: str) -> FaultList:
         lines |= {Fault(column, -1, number) for column in _replaced(band_faults.columns)}
         lines |= {Fault(-1, row, number) for row in _replaced(band_faults.rows)}
     pixels = set[Fault]()
-    for fault in _found_in_strips(source):
-        (lines if fault.column < 0 else pixels).add(fault)
-
-        if len(pixels) > MANY * raster.height_px * raster.width_px * raster.bands:
-            raise ImageError(
-                f"{name} has too many faulty pixels: more than {MANY:.0%}, apart from those of "
-                "faulty columns and rows. List the faulty pixels in a file."
-            )
+    steps = value_steps(source)
+    for top, stop in strips(raster.height_px, STRIP_PX):
+        # A pixel is compared with those around it, also beyond the strip.
+        start = max(top - PATCH_PX, 0)
+        end = min(stop + PATCH_PX, raster.height_px)
+        for band, plane in enumerate(as_floats(raster, source.read(start, end))):
+            number = band_number(band, raster)
+            dead = np.flatnonzero(constant_columns(plane.T)) + start
+            places = wrong_pixels(plane, steps[band]) + np.array([start, 0])
+            lines |= {Fault(-1, int(row), number) for row in dead if top <= row < stop}
+            pixels |= {
+                Fault(int(column), int(row), number) for row, column in places if top <= row < stop
+            }
+            if len(pixels) > MANY * raster.height_px * raster.width_px * raster.bands:
+                raise ImageError(
+                    f"{name} has too many faulty pixels: more than {MANY:.0%}, apart from those of "
+                    "faulty columns and rows. List the faulty pixels in a file."
+                )
     columns = {(fault.column, fault.band) for fault in lines if fault.row < 0}
     rows = {(fault.row, fault.band) for fault in lines if fault.column < 0}
     alone = {
@@ -183,24 +192,6 @@ def _replaced(stripes: Stripes) -> list[int]:
     WRONG_GAIN.
     """
     return [*stripes.dead, *(line.index for line in stripes.off if abs(line.gain) > WRONG_GAIN)]
-
-
-def _found_in_strips(source: Source) -> Iterator[Fault]:
-    """Find dead rows and wrong pixels, strip by strip."""
-    raster = source.raster
-    steps = value_steps(source)
-    for top, stop in strips(raster.height_px, STRIP_PX):
-        # A pixel is compared with those around it, also beyond the strip.
-        start = max(top - PATCH_PX, 0)
-        end = min(stop + PATCH_PX, raster.height_px)
-        for band, pixels in enumerate(as_floats(raster, source.read(start, end))):
-            number = band_number(band, raster)
-            dead = np.flatnonzero(constant_columns(pixels.T)) + start
-            places = wrong_pixels(pixels, steps[band]) + np.array([start, 0])
-            yield from (Fault(-1, int(row), number) for row in dead if top <= row < stop)
-            yield from (
-                Fault(int(column), int(row), number) for row, column in places if top <= row < stop
-            )
 
 
 class FixedSource:

@@ -161,7 +161,12 @@ class _Measurements:
         inner = valid[within]
         self._columns.append(measure_lines(pixels[within], inner))
         rows = []
-        for section in _sections(pixels.shape[1]):
+        width_px = pixels.shape[1]
+        count = min(max(width_px // SECTION_PX, 1), BLOCKS)
+        # First columns are even, so that all sections share the phase of a pattern of two pixels.
+        ends = [width_px * number // count // 2 * 2 for number in range(count)] + [width_px]
+        for left, right in pairwise(ends):
+            section = slice(left, right)
             rows.append(
                 measure_lines(pixels[:, section].T.copy(), valid[:, section].T.copy()).of(within)
             )
@@ -183,14 +188,6 @@ class _Measurements:
             pixels=np.concatenate(self._pixels),
             looked_px=self._looked_px,
         )
-
-
-def _sections(width_px: int) -> list[slice]:
-    """Return the sections of a strip, side by side, with even first columns."""
-    count = min(max(width_px // SECTION_PX, 1), BLOCKS)
-    # First columns are even, so that all sections share the phase of a pattern of two pixels.
-    ends = [width_px * number // count // 2 * 2 for number in range(count)] + [width_px]
-    return [slice(left, right) for left, right in pairwise(ends)]
 
 
 SHARPENS = "restoration about doubles it"
@@ -243,8 +240,14 @@ def _of_band(band: BandFaults, advise_fix: bool) -> Iterator[str]:
     yield from _of_lines("column", band.columns, advise_fix)
     yield from _of_lines("row", band.rows, advise_fix)
     for pattern in band.patterns:
-        if pattern.significant:
-            yield _of_pattern(pattern)
+        if not pattern.significant:
+            continue
+        shape = "a checkerboard" if pattern.name == "checkerboard" else pattern.name
+        size = f"{pattern.difference:.2%} rms of the level, {pattern.largest:.2%} at most"
+        advice = f"; {SHARPENS}: {EQUALIZE}, channel by channel"
+        if pattern.largest > COLOUR:
+            advice = ", as of a mosaic of colour filters: split the image into its colours first"
+        yield f"a fixed pattern of two pixels, {shape}: {size}{advice}"
     if len(band.pixels):
         places = [f"column {column}, row {row}" for row, column in band.pixels.tolist()]
         yield (
@@ -275,18 +278,6 @@ def _of_lines(one: str, lines: Stripes, advise_fix: bool) -> Iterator[str]:
         )
 
 
-def _of_pattern(pattern: Pattern) -> str:
-    shape = "a checkerboard" if pattern.name == "checkerboard" else pattern.name
-    size = f"{pattern.difference:.2%} rms of the level, {pattern.largest:.2%} at most"
-    message = f"a fixed pattern of two pixels, {shape}: {size}"
-
-    if pattern.largest > COLOUR:
-        return (
-            f"{message}, as of a mosaic of colour filters: split the image into its colours first"
-        )
-    return f"{message}; {SHARPENS}: {EQUALIZE}, channel by channel"
-
-
 def _some(places: Sequence[str]) -> str:
     """Return the first places as text, with a note if there are more of them."""
     more = f" and {len(places) - NAMED} more" if len(places) > NAMED else ""
@@ -302,28 +293,20 @@ def figures(bands: Sequence[BandFaults]) -> Mapping[str, Figure]:
     result = dict[str, Figure]()
     for number, band in enumerate(bands, 1):
         where = f"band {number}: " if len(bands) > 1 else ""
-        result |= {f"{where}{name}": figure for name, figure in _figures(band).items()}
+        how = f"{band.looked_px} pixels in strips of the image"
+        rms = f"rms over the level, without noise, {how}"
+        pattern = max((pattern.difference for pattern in band.patterns), default=math.nan)
+        off = len(band.columns.off) + len(band.rows.off)
+        dead = len(band.columns.dead) + len(band.rows.dead)
+        result |= {
+            f"{where}columns differ by": _spread(band.columns, rms),
+            f"{where}rows differ by": _spread(band.rows, rms),
+            f"{where}2 x 2 pattern": measured(100 * pattern, "%", f"the strongest of three, {rms}"),
+            f"{where}lines off": measured(off, "1", f"single columns and rows, {how}"),
+            f"{where}dead lines": measured(dead, "1", f"columns and rows, {how}"),
+            f"{where}wrong pixels": measured(len(band.pixels), "1", f"single ones, {how}"),
+        }
     return result
-
-
-def _figures(band: BandFaults) -> dict[str, Figure]:
-    how = f"{band.looked_px} pixels in strips of the image"
-    lines = {"columns": band.columns, "rows": band.rows}
-    rms = f"rms over the level, without noise, {how}"
-    pattern = max((pattern.difference for pattern in band.patterns), default=math.nan)
-    return {
-        **{f"{name} differ by": _spread(stripes, rms) for name, stripes in lines.items()},
-        "2 x 2 pattern": measured(100 * pattern, "%", f"the strongest of three, {rms}"),
-        "lines off": measured(
-            sum(len(stripes.off) for stripes in lines.values()),
-            "1",
-            f"single columns and rows, {how}",
-        ),
-        "dead lines": measured(
-            sum(len(stripes.dead) for stripes in lines.values()), "1", f"columns and rows, {how}"
-        ),
-        "wrong pixels": measured(len(band.pixels), "1", f"single ones, {how}"),
-    }
 
 
 def _spread(lines: Stripes, how: str) -> Figure:

@@ -5,7 +5,7 @@ compared with those in the profile (`comparison`).
 """
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -178,7 +178,17 @@ def band_windows(source: Source) -> list[list[np.ndarray]]:
         For each band its windows, raw values (h, w) each, 0 where pixels are missing. All bands
         have the same windows.
     """
-    return [list(windows) for windows in zip(*_windows(source), strict=True)]
+    raster = source.raster
+    by_band: list[list[np.ndarray]] = [[] for _ in range(raster.bands)]
+    for down in _spread(raster.height_px):
+        rows = source.read(down.start, down.stop)
+        values = np.ma.getdata(rows)
+        if raster.may_miss:
+            values = np.where(raster.missing(rows), 0, values)
+        for across in _spread(raster.width_px):
+            for windows, window in zip(by_band, values[:, :, across], strict=True):
+                windows.append(window)
+    return by_band
 
 
 def integer_step(windows: Sequence[np.ndarray]) -> int | None:
@@ -197,18 +207,6 @@ def integer_step(windows: Sequence[np.ndarray]) -> int | None:
     divisors = [np.gcd.reduce(window.astype(np.int64), axis=None) for window in windows]
     # The divisor of an image of zeros alone is 0.
     return max(int(np.gcd.reduce(divisors)), 1)
-
-
-def _windows(source: Source) -> Iterator[np.ndarray]:
-    """Yield windows (bands, h, w) spread evenly over an image, 0 where pixels are missing."""
-    raster = source.raster
-    for down in _spread(raster.height_px):
-        rows = source.read(down.start, down.stop)
-        values = np.ma.getdata(rows)
-        if raster.may_miss:
-            values = np.where(raster.missing(rows), 0, values)
-        for across in _spread(raster.width_px):
-            yield values[:, :, across]
 
 
 def _spread(size_px: int) -> list[slice]:

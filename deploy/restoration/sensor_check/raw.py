@@ -84,23 +84,15 @@ def _noise_share(windows: Sequence[np.ndarray], full_scale: float) -> float | No
         return None
     top = full_scale / step
     blocks = image_blocks((window / step for window in windows), top)
-    expected = _least_variance(blocks.mean, top)
+    # The least variance over all sensors that the networks were trained for. It is defined at 1/16
+    # and at 1/4 of full scale. A straight line through 0 and the first, and a constant from the
+    # second on, lie below the noise line of every sensor of the range, also where the dark is above
+    # 0.
+    light = np.maximum(blocks.mean / top - OFFSET, 0)
+    dark = RANGES["sigma_dark"][0] ** 2
+    bright = RANGES["sigma_bright"][0] ** 2
+    expected = top**2 * np.minimum(16 * dark * light, bright)
     judged = (expected >= LEAST_EXPECTED) & (blocks.fine > FILLED)
     if int(judged.sum()) < LEAST:
         return None
     return float(np.percentile(blocks.fine[judged] / (expected[judged] + ROUNDING), QUIET_PERCENT))
-
-
-def _least_variance(values: np.ndarray, full_scale: float) -> np.ndarray:
-    """Return the least variance of the noise at pixel values, over all sensors that the networks
-    were trained for.
-
-    The variance is defined at 1/16 and at 1/4 of full scale. A straight line through 0 and the
-    first, and a constant from the second on, lie below the noise line of every sensor of the range,
-    also where the dark is above 0.
-    """
-    # The variance of the noise is stated at 1/16 of full scale, hence 16 times the light.
-    light = np.maximum(values / full_scale - OFFSET, 0)
-    dark = RANGES["sigma_dark"][0] ** 2
-    bright = RANGES["sigma_bright"][0] ** 2
-    return np.asarray(full_scale**2 * np.minimum(16 * dark * light, bright))

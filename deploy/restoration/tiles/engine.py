@@ -136,9 +136,7 @@ class Restorer:
             return Tile(np.full(missing.shape, np.nan, np.float32), Tally())
         network = self.networks[place.group % len(self.networks)]
         window = self._window(strip, place)
-        restored = network.restore(window, self.full_scale, place[1:], self.plan.tiling)
-        tally = Tally(tiles=1, runs=restored.runs, brightened=restored.brightened)
-        pixels = restored.pixels
+        pixels, tally = network.restore(window, self.full_scale, place[1:], self.plan.tiling)
         if missing is not None:
             pixels = np.where(missing, np.float32(np.nan), pixels)
         return Tile(pixels, tally)
@@ -346,15 +344,13 @@ def as_stored(raster: Raster, restored: np.ndarray, full_scale: float) -> np.nda
     nodata = raster.nodata
     # A restored pixel lies between 0 and full scale, so another nodata value is never hit.
     if nodata is not None and 0 <= nodata <= full_scale:
-        result[result == result.dtype.type(nodata)] = _beside(raster, nodata, full_scale)
+        if raster.out_dtype.kind != "f":
+            beside = nodata + 1 if nodata + 1 <= full_scale else nodata - 1
+        else:
+            towards = full_scale if nodata < full_scale else 0
+            beside = float(np.nextafter(np.float32(nodata), np.float32(towards)))
+        result[result == result.dtype.type(nodata)] = beside
     return result
-
-
-def _beside(raster: Raster, nodata: float, full_scale: float) -> float:
-    if raster.out_dtype.kind != "f":
-        return nodata + 1 if nodata + 1 <= full_scale else nodata - 1
-    towards = full_scale if nodata < full_scale else 0
-    return float(np.nextafter(np.float32(nodata), np.float32(towards)))
 
 
 def fill_from_nearest(pixels: np.ndarray, missing: np.ndarray, reach_px: int) -> np.ndarray:

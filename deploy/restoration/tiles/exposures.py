@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 
@@ -11,25 +10,9 @@ from beers_deploy.model.exposure import choose_factors
 from beers_deploy.profiles.errors import ImageError, ModelError
 from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.quant.untrusted import times
+from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Plan, Span
 from beers_deploy.restoration.runtime import Infer
-
-
-class Exposed(NamedTuple):
-    """The result of restoring the window of one tile at the exposures that its pixels need.
-
-    An exposure is a factor by which pixels are multiplied before the network, and divided
-    afterwards.
-
-    Attributes:
-        pixels: the retained pixels (bands, h, w), float32 in 0..full_scale, not rounded.
-        runs: the number of runs of the network, one for each factor.
-        brightened: the number of retained pixels that were restored at a factor above 1.
-    """
-
-    pixels: np.ndarray
-    runs: int
-    brightened: int
 
 
 @dataclass(frozen=True)
@@ -53,7 +36,7 @@ class ExposedNetwork:
 
     def restore(
         self, window: np.ndarray, full_scale: float, spans: tuple[Span, Span], tiling: Tiling
-    ) -> Exposed:
+    ) -> tuple[np.ndarray, Tally]:
         """Restore the window of one tile at each factor that its retained pixels need.
 
         Args:
@@ -61,6 +44,11 @@ class ExposedNetwork:
             full_scale: the pixel value that is 1.0 to the network.
             spans: the rows and columns of the image that the window reads and retains.
             tiling: the network's tiling geometry.
+
+        Returns:
+            The retained pixels (bands, h, w), float32 in 0..full_scale, not rounded; and the number
+            of runs of the network, one for each factor, and of retained pixels that were restored
+            at a factor above 1.
 
         Raises:
             ModelError: the result has another shape than the network's file states.
@@ -76,34 +64,29 @@ class ExposedNetwork:
                     f"The network returned a result of {times(restored.shape)}, but its file "
                     f"states {times(shape)}. Export it for images of any size, or check its sizes."
                 )
-            return Exposed(restored[:, down, across], 1, 0)
+            return restored[:, down, across], Tally(tiles=1, runs=1)
         image = np.asarray(window[0], np.float32)
         rising = sorted(self.infers)
         choice = choose_factors(image, rising, self.radius_px, full_scale, self.offset)
         # Only a network that returns one pixel for each pixel has several factors.
         choice = choice[down, across]
         pixels = np.zeros((1, *choice.shape), np.float32)
+        offset = np.float32(self.offset)
+        top = np.float32(full_scale)
         factors = np.unique(choice).tolist()
         for factor in factors:
-            restored = self._at(factor, image, full_scale)[:, down, across]
-            pixels = np.where(choice == factor, restored, pixels)
-        return Exposed(pixels, len(factors), int((choice > 1).sum()))
-
-    def _at(self, factor: float, image: np.ndarray, full_scale: float) -> np.ndarray:
-        """Restore an image (h, w) at one factor, and return its pixels, (1, h, w), divided by the
-        factor again.
-        """
-        if factor == 1:
-            return restore_window(image[None], self.infers[1], full_scale)
-        offset = np.float32(self.offset)
-        # Pixels that exceed full scale lie beyond the network's reach of every pixel that takes
-        # this factor.
-        multiplied = np.clip(
-            (image - offset) * np.float32(factor) + offset, 0, np.float32(full_scale)
-        )
-        restored = restore_window(multiplied[None], self.infers[factor], full_scale)
-        divided = (restored - offset) / np.float32(factor) + offset
-        return np.asarray(np.clip(divided, 0, np.float32(full_scale)))
+            multiplied = image
+            if factor != 1:
+                multiplied = (image - offset) * np.float32(factor) + offset
+                # Pixels that exceed full scale lie beyond the network's reach of every pixel that
+                # takes this factor.
+                multiplied = np.clip(multiplied, 0, top)
+            restored = restore_window(multiplied[None], self.infers[factor], full_scale)
+            if factor != 1:
+                restored = np.clip((restored - offset) / np.float32(factor) + offset, 0, top)
+            pixels = np.where(choice == factor, restored[:, down, across], pixels)
+        tally = Tally(tiles=1, runs=len(factors), brightened=int((choice > 1).sum()))
+        return pixels, tally
 
 
 def tiles_by_factor(
