@@ -7,8 +7,7 @@
    removed. Only those at the border, which really convert, remain as operations.
 """
 
-from collections.abc import Iterator, Sequence
-from itertools import chain
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -120,7 +119,7 @@ def network_of(
             "export' or 'beers-deploy quantize'."
         )
     with contradictions(where):
-        return _Reader(with_shuffles(model), inputs_of(model, tile_px, where)).network()
+        return _sized(with_shuffles(model), inputs_of(model, tile_px, where))
 
 
 def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str) -> dict[str, Shape]:
@@ -169,43 +168,38 @@ def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str) -> dict[s
     return shapes
 
 
-class _Reader:
-    """A conversion of one ONNX graph, which visits the nodes once in topological order and
-    propagates shapes and number formats.
+def _sized(graph: OnnxGraph, inputs: dict[str, Shape]) -> SizedGraph:
+    """Return the operations of a graph, without the notation of quantisation.
+
+    The nodes are visited once in topological order, and shapes and number formats are propagated.
     """
-
-    def __init__(self, graph: OnnxGraph, inputs: dict[str, Shape]) -> None:
-        self.graph = graph
-        self.inputs = inputs
-        self.shapes: dict[str, Shape | None] = dict(inputs)
-        self.kinds: dict[str, Kind] = {}
-        self.integers = Integers(graph)
-
-    def network(self) -> SizedGraph:
-        """Return the operations, without the notation of quantisation."""
-        operations = tuple(chain.from_iterable(map(self._read, self.graph.nodes)))
-        outputs = tuple(map(self.integers.resolve, self.graph.outputs))
-        return SizedGraph(operations, self.inputs, outputs, self.integers.present)
-
-    def _read(self, node: Node) -> Iterator[Operation]:
-        if self.integers.is_notation(node):
-            return
-        weight = self.integers.weight(node)
-        kind = "activation" if self._is_activation(node) else kind_of(node, weight)
-        inputs = self.integers.activations(node)
-        formats = self.integers.formats(node)
-        shapes = tuple(map(self.shapes.get, inputs))
+    integers = Integers(graph)
+    shape_of: dict[str, Shape | None] = dict(inputs)
+    kind_by_name: dict[str, Kind] = {}
+    operations = []
+    for node in graph.nodes:
+        if integers.is_notation(node):
+            continue
+        weight = integers.weight(node)
+        kind = "activation" if _is_activation(node, graph, integers) else kind_of(node, weight)
+        sources = integers.activations(node)
+        formats = integers.formats(node)
+        shapes = tuple(map(shape_of.get, sources))
         kernel, window = _window(node, weight, shapes)
         channels = _channels(node, weight, shapes)
-        shape = out_shape(node, kind, shapes, kernel, window, channels[1], self.graph.constants)
-        outputs = tuple(self.integers.resolve(name) for name in node.outputs if name)
-        self.shapes |= dict.fromkeys(outputs, shape)
-        self.kinds |= dict.fromkeys(outputs, kind)
-        yield Operation(
+        shape = out_shape(node, kind, shapes, kernel, window, channels[1], graph.constants)
+        outputs = tuple(integers.resolve(name) for name in node.outputs if name)
+        shape_of |= dict.fromkeys(outputs, shape)
+        kind_by_name |= dict.fromkeys(outputs, kind)
+        operand = None
+        # An element-wise operator with one activation has a constant operand.
+        if len(sources) == 1 and (kind in ("add", "mul") or node.op_type in ("Sub", "Div")):
+            operand = integers.operand(node)
+        operation = Operation(
             name=node.name,
             op_type=node.op_type,
             kind=kind,
-            inputs=inputs,
+            inputs=sources,
             outputs=outputs,
             in_shapes=shapes,
             out_shape=shape,
@@ -213,38 +207,32 @@ class _Reader:
             window=window,
             channels=channels,
             weight_bytes=weight.size if weight is not None else 0,
-            constant_shape=self._constant_shape(node, kind, inputs),
+            constant_shape=None if operand is None else operand.shape,
             attributes=node.attributes,
-            follows=self.kinds.get(inputs[0]) if inputs else None,
-            integer=self.integers.is_integer(node),
+            follows=kind_by_name.get(sources[0]) if sources else None,
+            integer=integers.is_integer(node),
             scales={role: scales[0] for role, scales in formats.items() if scales},
             disputed={role: scales for role, scales in formats.items() if len(scales) > 1},
-            constants=self.integers.numbers(node),
+            constants=integers.numbers(node),
         )
+        operations.append(operation)
+    network_outputs = tuple(map(integers.resolve, graph.outputs))
+    return SizedGraph(tuple(operations), inputs, network_outputs, integers.present)
 
-    def _is_activation(self, node: Node) -> bool:
-        """Return True for the activations of integer files and banks.
 
-        These are max(q, zero point), which is the ReLU of integers, Clip from 0 to 6, which is
-        ReLU6, and the Clip of a bank at the limits where int8 saturates.
-        """
-        values = [self.graph.value(node, k) for k in range(1, len(node.inputs))]
-        constants = [value for value in values if value is not None]
-        if node.op_type == "Max":
-            return self.integers.is_integer(node) and len(constants) == len(values) == 1
-        # A limit that is no single constant cannot be ReLU6, and is left out: the lists then
-        # differ.
-        limits = [float(value.ravel()[0]) for value in constants if value.size == 1]
-        return node.op_type == "Clip" and limits in ([0.0, 6.0], *BANK_ENDS)
+def _is_activation(node: Node, graph: OnnxGraph, integers: Integers) -> bool:
+    """Return True for the activations of integer files and banks.
 
-    def _constant_shape(
-        self, node: Node, kind: Kind, inputs: Sequence[str]
-    ) -> tuple[int, ...] | None:
-        """Return the shape of the constant operand of an element-wise operator, or None."""
-        if len(inputs) != 1 or (kind not in ("add", "mul") and node.op_type not in ("Sub", "Div")):
-            return None
-        value = self.integers.operand(node)
-        return None if value is None else value.shape
+    These are max(q, zero point), which is the ReLU of integers, Clip from 0 to 6, which is ReLU6,
+    and the Clip of a bank at the limits where int8 saturates.
+    """
+    values = [graph.value(node, k) for k in range(1, len(node.inputs))]
+    constants = [value for value in values if value is not None]
+    if node.op_type == "Max":
+        return integers.is_integer(node) and len(constants) == len(values) == 1
+    # A limit that is no single constant cannot be ReLU6, and is left out: the lists then differ.
+    limits = [float(value.ravel()[0]) for value in constants if value.size == 1]
+    return node.op_type == "Clip" and limits in ([0.0, 6.0], *BANK_ENDS)
 
 
 def _window(

@@ -5,8 +5,7 @@ reported with each time.
 """
 
 import statistics
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -22,83 +21,45 @@ from beers_deploy.performance.timing import cpu_load, interleaved, resident_byte
 from beers_deploy.profiles.figures import Figure, Row, measured
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.quant.onnx_file import is_quantized
 from beers_deploy.quant.session import open_session, require_finite
 
+Samples = Sequence[tuple[float, Figure]]
+"""The time in s and the mean power in W of each run."""
 
-@dataclass
-class Timed:
-    """A network with the measurements of its runs on this machine.
 
-    Attributes:
-        name: the name of the network in tables.
-        model: the network.
-        times_s: the time of each run in s.
-        powers: the mean power in W during each run; unavailable where no counter can be read.
-        held_bytes: the rise of this process's memory by opening the network and running it once.
+def _opened(
+    model: onnx.ModelProto, name: str, tile_px: int, threads: int
+) -> tuple[Callable[[], object], int]:
+    """Return a call that runs a network on a grey tile, and the rise of this process's memory in
+    bytes by opening the network and running it once.
     """
-
-    name: str
-    model: onnx.ModelProto
-    times_s: list[float] = field(default_factory=list)
-    powers: list[Figure] = field(default_factory=list)
-    held_bytes: int = 0
-
-
-def time_networks(
-    runs: Sequence[Timed], tile_px: int, threads: int, min_time_s: float, min_runs: int
-) -> None:
-    """Time networks on a grey tile on this processor, and add the results to `runs`.
-
-    The networks run in turn until each has run for `min_time_s` in total and `min_runs` times, so
-    that other load on the machine affects all of them alike.
-
-    Args:
-        runs: the networks. Their times, powers and memory are filled in.
-        tile_px: side of the tile in pixels.
-        threads: the number of threads of onnxruntime; 0 for its default.
-        min_time_s: the shortest total time of a network's runs, in s.
-        min_runs: the smallest number of runs of a network.
-    """
-    calls = []
-    for run in runs:
-        shapes = inputs_of(run.model, tile_px, run.name)
-        feed = {name: np.full((1, *shape), 0.25, np.float32) for name, shape in shapes.items()}
-        before_bytes = resident_bytes()
-        session = open_session(run.model, threads)
-        require_finite(session.run(None, feed), run.name)  # warm-up, not counted
-        run.held_bytes = resident_bytes() - before_bytes
-        calls.append(partial(session.run, None, feed))
-
-    for run, samples in zip(runs, interleaved(calls, min_runs, min_time_s), strict=True):
-        run.times_s += [time_s for time_s, _ in samples]
-        run.powers += [power for _, power in samples]
+    shapes = inputs_of(model, tile_px, name)
+    feed = {key: np.full((1, *shape), 0.25, np.float32) for key, shape in shapes.items()}
+    before_bytes = resident_bytes()
+    session = open_session(model, threads)
+    require_finite(session.run(None, feed), name)  # warm-up, not counted
+    return partial(session.run, None, feed), resident_bytes() - before_bytes
 
 
-def _row(run: Timed, tile_px: int, conditions: Mapping[str, Figure]) -> Row:
-    times_ms = 1e3 * np.array(run.times_s)
-    total_s = sum(run.times_s)
-    source = f"{len(run.times_s)} runs in {total_s:.1f} s after one for warm-up, loading left out"
+def _figures(samples: Samples, held_bytes: int) -> dict[str, Figure]:
+    """Return the figures of the runs of a network."""
+    times_s = [time_s for time_s, _ in samples]
+    times_ms = 1e3 * np.array(times_s)
+    total_s = sum(times_s)
+    source = f"{len(times_s)} runs in {total_s:.1f} s after one for warm-up, loading left out"
     memory = "rise of resident memory once the file was opened and had run once"
-    figures = {
+    power = next((each for _, each in samples if each.value is None), samples[0][1])
+    if power.value is not None:
+        # Runs differ in length: the mean power is energy over time, not the mean of the powers.
+        energy_j = sum((each.value or 0.0) * time_s for time_s, each in samples)
+        power = measured(energy_j / total_s, "W", power.source)
+    return {
         "p50": measured(float(np.percentile(times_ms, 50)), "ms/tile", source),
         "p90": measured(float(np.percentile(times_ms, 90)), "ms/tile", source),
-        "throughput": measured(len(run.times_s) / total_s, "frame/s", source),
-        "power": _mean_power(run),
-        "memory": measured(run.held_bytes / 1e6, "MB", memory),
+        "throughput": measured(len(times_s) / total_s, "frame/s", source),
+        "power": power,
+        "memory": measured(held_bytes / 1e6, "MB", memory),
     }
-    return Row("host", f"{run.name}, {tile_px} x {tile_px}", {**figures, **conditions})
-
-
-def _mean_power(run: Timed) -> Figure:
-    """Return the mean power over the network's own runs, or the figure that is unavailable."""
-    # Runs differ in length: the mean power is energy over time, not the mean of the powers.
-    energy_j = 0.0
-    for power, time_s in zip(run.powers, run.times_s, strict=True):
-        if power.value is None:
-            return power
-        energy_j += power.value * time_s
-    return measured(energy_j / sum(run.times_s), "W", run.powers[0].source)
 
 
 def host_rows(
@@ -128,24 +89,27 @@ def host_rows(
     require_cores("threads", threads)
     source = Network.load(network)
     other = other_precision(source)
-    runs = [Timed(source.name, source.model)]
+    networks = {source.name: source}
     if other is not None:
         precision = "INT8" if other.precision == "int8" else "float32"
-        runs.append(Timed(f"{precision} of the same shape", other.model))
+        networks[f"{precision} of the same shape"] = other
     min_time_s = target.value("measurement", "min_time_s")
     min_runs = int(target.value("measurement", "min_runs"))
     # The load is measured from one call to the next: this one opens the window of the timed runs.
     cpu_load()
-    time_networks(runs, tile_px, threads, min_time_s, min_runs)
+    opened = [_opened(each.model, name, tile_px, threads) for name, each in networks.items()]
+    runs = interleaved([call for call, _ in opened], min_runs, min_time_s)
     conditions = conditions_of(threads or psutil.cpu_count(logical=False) or 1)
-    rows = [_row(run, tile_px, conditions) for run in runs]
+    rows = []
+    for name, samples, (_, held_bytes) in zip(networks, runs, opened, strict=True):
+        figures = _figures(samples, held_bytes) | conditions
+        rows.append(Row("host", f"{name}, {tile_px} x {tile_px}", figures))
     if sensor is not None:
         rows.append(step_row(sensor, tile_px, min_time_s, min_runs))
     if other is not None:
-        # False sorts before True: the INT8 network comes last.
-        float32, int8 = sorted(runs, key=lambda run: is_quantized(run.model))
-        ratio = statistics.median(float32.times_s) / statistics.median(int8.times_s)
-        figure = measured(ratio, "x", f"medians of {len(int8.times_s)} runs each, interleaved")
+        own_s, other_s = (statistics.median(time_s for time_s, _ in run) for run in runs)
+        ratio = own_s / other_s if other.precision == "int8" else other_s / own_s
+        figure = measured(ratio, "x", f"medians of {len(runs[0])} runs each, interleaved")
         rows.append(Row("host", "float32 time / INT8 time, here", {"ratio": figure}))
     return rows
 

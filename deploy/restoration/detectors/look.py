@@ -11,7 +11,7 @@ import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 
@@ -82,14 +82,15 @@ def look_at_detectors(source: Source, full_scale: float = np.inf) -> tuple[BandF
         The faults of each band, in the order of the bands.
     """
     raster = source.raster
-    measurements = [_Measurements(step) for step in value_steps(source)]
+    steps = value_steps(source)
+    strips: list[list[StripLook]] = [[] for _ in steps]
     for top, stop in _strips(raster.height_px, raster.width_px, raster.bands):
         start = max(top - MARGIN_PX, 0)
         end = min(stop + MARGIN_PX, raster.height_px)
         within = slice(top - start, stop - start)
         for band, pixels in enumerate(as_floats(raster, source.read(start, end))):
-            measurements[band].add(start, within, pixels, full_scale)
-    return tuple(measurement.judged() for measurement in measurements)
+            strips[band].append(_measured(start, within, pixels, steps[band], full_scale))
+    return tuple(map(_judged, strips))
 
 
 def as_floats(raster: Raster, stored: np.ndarray) -> np.ndarray:
@@ -135,59 +136,62 @@ def _strips(height_px: int, width_px: int, bands: int) -> Iterator[tuple[int, in
         yield even, even + side_px
 
 
-class _Measurements:
-    """The measurements in the strips of one band."""
+StripLook = tuple[Blocks, Blocks, range, list[tuple[np.ndarray, np.ndarray]], np.ndarray, int]
+"""The measurements in one strip of a band: columns, rows, the numbers of the rows in the image,
+patterns of two pixels, places of wrong pixels, and the number of known pixels.
+"""
 
-    def __init__(self, step: float) -> None:
-        self._step = step
-        self._columns = list[Blocks]()
-        self._rows = list[Blocks]()
-        self._row_numbers = list[int]()
-        self._phases = list[tuple[np.ndarray, np.ndarray]]()
-        self._pixels = list[np.ndarray]()
-        self._looked_px = 0
 
-    def add(self, top: int, within: slice, pixels: np.ndarray, full_scale: float) -> None:
-        """Measure a strip.
+def _measured(
+    top: int, within: slice, pixels: np.ndarray, step: float, full_scale: float
+) -> StripLook:
+    """Measure a strip of a band.
 
-        Args:
-            top: the row of the image at which `pixels` begins.
-            within: the rows of `pixels` that are checked; the rows around are for comparison.
-            pixels: (h, w), NaN where they are missing.
-            full_scale: the value at and above which a pixel is saturated and does not count.
-        """
-        # The converter clips at 0 and at full scale, where a pixel no longer follows its gain.
-        valid = (pixels > 0) & (pixels < full_scale)
-        inner = valid[within]
-        self._columns.append(measure_lines(pixels[within], inner))
-        rows = []
-        width_px = pixels.shape[1]
-        count = min(max(width_px // SECTION_PX, 1), BLOCKS)
-        # First columns are even, so that all sections share the phase of a pattern of two pixels.
-        ends = [width_px * number // count // 2 * 2 for number in range(count)] + [width_px]
-        for left, right in pairwise(ends):
-            section = slice(left, right)
-            rows.append(
-                measure_lines(pixels[:, section].T.copy(), valid[:, section].T.copy()).of(within)
-            )
-            self._phases.append(measure_phases(pixels[within, section], inner[:, section]))
-        self._rows.append(join_blocks(rows))
-        self._row_numbers += range(top + within.start, top + within.stop)
-        places = wrong_pixels(pixels, self._step)
-        judged = (places[:, 0] >= within.start) & (places[:, 0] < within.stop)
-        self._pixels.append(places[judged] + np.array([top, 0]))
-        self._looked_px += int(np.isfinite(pixels[within]).sum())
-
-    def judged(self) -> BandFaults:
-        """Evaluate all strips together, and return the faults of the band."""
-        rows = judge_lines(join_blocks(self._rows, axis=1), LEAST)
-        return BandFaults(
-            columns=judge_lines(join_blocks(self._columns), LEAST),
-            rows=rows.renumbered(self._row_numbers),
-            patterns=judge_phases(self._phases, LEAST),
-            pixels=np.concatenate(self._pixels),
-            looked_px=self._looked_px,
+    Args:
+        top: the row of the image at which `pixels` begins.
+        within: the rows of `pixels` that are checked; the rows around are for comparison.
+        pixels: (h, w), NaN where they are missing.
+        step: the step between pixel values.
+        full_scale: the value at and above which a pixel is saturated and does not count.
+    """
+    # The converter clips at 0 and at full scale, where a pixel no longer follows its gain.
+    valid = (pixels > 0) & (pixels < full_scale)
+    inner = valid[within]
+    width_px = pixels.shape[1]
+    count = min(max(width_px // SECTION_PX, 1), BLOCKS)
+    # First columns are even, so that all sections share the phase of a pattern of two pixels.
+    ends = [width_px * number // count // 2 * 2 for number in range(count)] + [width_px]
+    rows = []
+    phases = []
+    for left, right in pairwise(ends):
+        section = slice(left, right)
+        rows.append(
+            measure_lines(pixels[:, section].T.copy(), valid[:, section].T.copy()).of(within)
         )
+        phases.append(measure_phases(pixels[within, section], inner[:, section]))
+    places = wrong_pixels(pixels, step)
+    inside = (places[:, 0] >= within.start) & (places[:, 0] < within.stop)
+    return (
+        measure_lines(pixels[within], inner),
+        join_blocks(rows),
+        range(top + within.start, top + within.stop),
+        phases,
+        places[inside] + np.array([top, 0]),
+        int(np.isfinite(pixels[within]).sum()),
+    )
+
+
+def _judged(strips: Sequence[StripLook]) -> BandFaults:
+    """Evaluate all strips of a band together, and return the faults of the band."""
+    columns, rows, numbers, phases, pixels, looked_px = zip(*strips, strict=True)
+    row_stripes = judge_lines(join_blocks(rows, axis=1), LEAST)
+    return BandFaults(
+        columns=judge_lines(join_blocks(columns), LEAST),
+        rows=row_stripes.renumbered(list(chain.from_iterable(numbers))),
+        patterns=judge_phases(list(chain.from_iterable(phases)), LEAST),
+        pixels=np.concatenate(pixels),
+        looked_px=sum(looked_px),
+    )
 
 
 SHARPENS = "restoration about doubles it"

@@ -114,13 +114,12 @@ def open_frames(images: Sequence[Path], bits: int | None, black_level: float | N
             "One of the `images` is given twice, but the same pixels add no information. Give "
             "each image once."
         )
-    looks = [_look(path) for path in paths]
-    step = int(np.gcd.reduce([look.step for look in looks]))
-    largest = max(look.largest for look in looks)
-    bit_count = _settled_bits(bits, largest, step, any(look.piled for look in looks))
+    own_steps, largest, piled, darkest, middles = zip(*map(_look, paths), strict=True)
+    step = int(np.gcd.reduce(own_steps))
+    bit_count = _settled_bits(bits, max(largest), step, any(piled))
     black_dn = (black_level or 0.0) / step
-    darkest_dn = min(look.darkest for look in looks) / step
-    middle_dn = float(np.median([look.middle for look in looks])) / step
+    darkest_dn = min(darkest) / step
+    middle_dn = float(np.median(middles)) / step
     if not 0 <= black_dn < max(middle_dn, 1.0):
         raise OptionError(
             "`black_level` must be at least 0 and below the median of the images, "
@@ -129,26 +128,11 @@ def open_frames(images: Sequence[Path], bits: int | None, black_level: float | N
     return Frames(paths, step, bit_count, bits is not None, black_dn, darkest_dn)
 
 
-@dataclass(frozen=True)
-class _Look:
-    """Statistics of the stored values of one frame.
-
-    Attributes:
-        step: the largest integer that divides all values.
-        largest: the largest value.
-        piled: True if pixels accumulate at the largest value, as they do only at full scale.
-        darkest: the value of the darkest pixels.
-        middle: the median of the values.
+def _look(path: Path) -> tuple[int, int, bool, float, float]:
+    """Return statistics of the stored values of one frame: the largest integer that divides all
+    values, the largest value, True if pixels accumulate there, as they do only at full scale, the
+    value of the darkest pixels, and the median.
     """
-
-    step: int
-    largest: int
-    piled: bool
-    darkest: float
-    middle: float
-
-
-def _look(path: Path) -> _Look:
     pixels = read_raw(path)
     values = pixels.astype(np.int64, copy=False).ravel()
     largest = int(values.max())
@@ -169,7 +153,7 @@ def _look(path: Path) -> _Look:
     # 0 also stands for a missing pixel, so it says nothing about the dark.
     present = values[values > 0]
     darkest, middle = np.percentile(present, [DARKEST_PERCENT, 50]) if present.size else (0.0, 0.0)
-    return _Look(step, largest, piled, float(darkest), float(middle))
+    return step, largest, piled, float(darkest), float(middle)
 
 
 def _settled_bits(stated: int | None, largest: int, step: int, piled: bool) -> int:
