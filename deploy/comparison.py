@@ -91,21 +91,16 @@ class Data:
             OptionError: there are no samples, and simulated patches do not suit the network.
         """
         ranges = self.input_range
-        if int8 is not None and self._has_pictures:
-            with faults_named(int8.label):
-                ranges = int8.stated_ranges or ranges
+        if int8 is not None and isinstance(self.samples, str | os.PathLike):
+            suffixes = {file.suffix.lower() for file in sample_files(Path(self.samples))}
+            if suffixes & IMAGE_SUFFIXES:
+                with faults_named(int8.label):
+                    ranges = int8.stated_ranges or ranges
         with faults_named(network.label):
             own = samples_of(network.model, self.samples, ranges)
         if own is not None and int8 is not None:
             require_in_range(own.ranges, int8)
         return own
-
-    @property
-    def _has_pictures(self) -> bool:
-        if not isinstance(self.samples, str | os.PathLike):
-            return False
-        files = sample_files(Path(self.samples))
-        return any(file.suffix.lower() in IMAGE_SUFFIXES for file in files)
 
     @property
     def simulated(self) -> "Calibration":

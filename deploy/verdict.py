@@ -373,26 +373,25 @@ def file_checks(
 
 def junit_text(title: str, checks: Sequence[Check]) -> str:
     """Write checks as JUnit XML: a test suite named `title` with a test case for each check."""
-    faults = {
-        check.name: f"found {check.actual}, allowed {check.allowed}"
+    cases = {
+        check.name: "" if check.passed else f"found {check.actual}, allowed {check.allowed}"
         for check in checks
-        if not check.passed
     }
-    return _junit(title, "failure", [check.name for check in checks], faults)
+    return _junit(title, "failure", cases)
 
 
 def junit_error(title: str, message: str) -> str:
     """Return the JUnit XML of a gate that stopped with an error, whose message is `message`."""
-    return _junit(title, "error", ["gate"], {"gate": printable(message, JUNIT_CHARACTERS)})
+    return _junit(title, "error", {"gate": printable(message, JUNIT_CHARACTERS)})
 
 
-def _junit(title: str, kind: str, cases: Sequence[str], faults: Mapping[str, str]) -> str:
+def _junit(title: str, kind: str, cases: Mapping[str, str]) -> str:
+    """Return JUnit XML of test cases, each with the text of its fault, or "" if it passed."""
     counts = {"tests": str(len(cases)), "failures": "0", "errors": "0"}
-    counts[f"{kind}s"] = str(len(faults))
+    counts[f"{kind}s"] = str(sum(map(bool, cases.values())))
     suite = ET.Element("testsuite", name=printable(title), attrib=counts)
-    for name in cases:
+    for name, text in cases.items():
         case = ET.SubElement(suite, "testcase", classname=printable(title), name=name)
-        if name in faults:
-            text = faults[name]
+        if text:
             ET.SubElement(case, kind, message=text).text = text
     return ET.tostring(suite, encoding="unicode") + "\n"

@@ -70,6 +70,16 @@ class Operation:
         return self.outputs[0]
 
     @property
+    def in_shape(self) -> Shape | None:
+        """Return the shape (C, H, W) of the first input; None if unknown or without inputs."""
+        return self.in_shapes[0] if self.in_shapes else None
+
+    @property
+    def kernel_area(self) -> int:
+        """Return the number of positions of the kernel."""
+        return self.kernel[0] * self.kernel[1]
+
+    @property
     def operations(self) -> int:
         """Return the number of int8 operations for one image; 0 if the node is no convolution.
 
@@ -80,7 +90,7 @@ class Operation:
         if self.kind not in CONVOLUTIONS:
             return 0
         # A transposed convolution multiplies the weights with each pixel of its input.
-        shape = self.in_shapes[0] if self.kind == "transposed" else self.out_shape
+        shape = self.in_shape if self.kind == "transposed" else self.out_shape
         # A weight has one byte and is used once a pixel: a product and a sum are two operations.
         return 2 * self.weight_bytes * _pixels(self.name, shape)
 

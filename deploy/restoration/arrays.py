@@ -120,7 +120,16 @@ def _restore(
     nodata = usable_nodata(value, dtype)
     raster = Raster(count, height_px, width_px, dtype, nodata, mask_kind=mask_kind)
     if not hasattr(image, "__dask_graph__"):
-        results = _restore_now(bands, raster, reading, load(), level)
+        work = load().prepare(ArraySource(bands, raster), reading, NAME)
+        widths = () if level is None else half_widths_of(work, level)
+        with steps("restoring", work.ticks(0)) as bar:
+            pixels, tally = gathered(work.rows(0, bar.advance), work.out_shape, raster.out_dtype)
+        if not reading.force:
+            tally.require(name=NAME)
+        results = [pixels]
+        if widths:
+            half = HalfWidths(work.source, lambda band, top, stop: pixels[band, top:stop], widths)
+            results.append(np.stack([half.read(band, 0, height_px) for band in range(count)]))
     elif np.ma.isMaskedArray(getattr(image, "_meta", None)):
         raise ImageError(
             "`image` is a masked Dask array, which is not supported. Fill it with "
@@ -166,24 +175,6 @@ def _labelled(image: Any, pixels: Any) -> Any:
         between = places[left] + (at - left) * (places[left + 1] - places[left])
         coordinates[dim] = (dim, between, image.coords[dim].attrs)
     return type(image)(pixels, coordinates, dims, image.name, image.attrs)
-
-
-def _restore_now(
-    bands: np.ndarray, raster: Raster, reading: Reading, pipeline: Pipeline, level: Level | None
-) -> list[np.ndarray]:
-    work = pipeline.prepare(ArraySource(bands, raster), reading, NAME)
-    widths = () if level is None else half_widths_of(work, level)
-    with steps("restoring", work.ticks(0)) as bar:
-        pixels, tally = gathered(work.rows(0, bar.advance), work.out_shape, raster.out_dtype)
-    if not reading.force:
-        tally.require(name=NAME)
-    if not widths:
-        return [pixels]
-    half = HalfWidths(work.source, lambda band, top, stop: pixels[band, top:stop], widths)
-    return [
-        pixels,
-        np.stack([half.read(band, 0, raster.height_px) for band in range(raster.bands)]),
-    ]
 
 
 BAND_DIMS = ("band", "bands", "channel", "wavelength")

@@ -96,26 +96,21 @@ def networks_of(
             f"The sensors have different bits ({', '.join(map(str, sorted(bits)))}). Give "
             "`full_scale`, or restore such bands separately."
         )
-    _log_network(first, sensors)
-    return networks
-
-
-def _log_network(network: Network, sensors: Mapping[str, Sensor]) -> None:
-    """Log which network restores, and warn if it was made for another sensor."""
-    names = ", ".join(sensor.name for sensor in sensors.values())
-    if network.weights is None:
+    if first.weights is None:
         (sensor,) = sensors.values()
-        warning = other_sensor(network.model, sensor)
+        warning = other_sensor(first.model, sensor)
         if warning:
             logger.warning(warning)
     elif is_unknown(sensors):
         logger.info(
             "network: %s, for an unknown sensor: the result may be worse than the image if yours "
             "is sharper or noisier than assumed. Name it with `sensor`",
-            network.name,
+            first.name,
         )
     else:
-        logger.info("network: %s, conditioned on %s", network.name, names)
+        names = ", ".join(sensor.name for sensor in sensors.values())
+        logger.info("network: %s, conditioned on %s", first.name, names)
+    return networks
 
 
 def in_order(items: Mapping[str, Each], raster: Raster) -> list[Each]:

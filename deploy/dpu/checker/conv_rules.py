@@ -50,9 +50,12 @@ def conv_weight_bank(op: Operation, dpu: Dpu) -> Finding | None:
     ceil(output channels at a time / {memory[weight_banks]}) + {conv[weight_bias_depth]} for the
     bias.
     """
-    area = op.kernel[0] * op.kernel[1]
     inputs = groups_of(op.channels[0], dpu.input_parallel)
-    depth = area * inputs * groups_of(dpu.output_parallel, dpu.whole("memory", "weight_banks"))
+    depth = (
+        op.kernel_area
+        * inputs
+        * groups_of(dpu.output_parallel, dpu.whole("memory", "weight_banks"))
+    )
     # The bias lies in the same buffer.
     depth += dpu.whole("conv", "weight_bias_depth")
     most = dpu.whole("memory", "weight_bank_depth")
@@ -71,8 +74,7 @@ def conv_window(op: Operation, dpu: Dpu) -> Finding | None:
     """Kernel area * ceil(ic / {conv[window_channels]}) is at most {conv[window_max]}
     ({conv[window_max].source}).
     """
-    area = op.kernel[0] * op.kernel[1]
-    size = area * groups_of(op.channels[0], max(dpu.whole("conv", "window_channels"), 1))
+    size = op.kernel_area * groups_of(op.channels[0], max(dpu.whole("conv", "window_channels"), 1))
     most = dpu.whole("conv", "window_max")
     if size <= most:
         return None
@@ -84,12 +86,11 @@ def conv_window(op: Operation, dpu: Dpu) -> Finding | None:
 
 def conv_area(op: Operation, dpu: Dpu) -> Finding | None:
     """The kernel's height * width is at most {conv[area_max]} ({conv[area_max].source})."""
-    area = op.kernel[0] * op.kernel[1]
     most = dpu.value("conv", "area_max")
-    if area <= most:
+    if op.kernel_area <= most:
         return None
     side = math.isqrt(max(int(most), 1))
-    reason = f"kernel ({shown(op.kernel)}) has {area} positions: at most {int(most)}"
+    reason = f"kernel ({shown(op.kernel)}) has {op.kernel_area} positions: at most {int(most)}"
     return Finding(reason, f"use a kernel of at most {side} x {side}, or stack small ones")
 
 
@@ -125,12 +126,11 @@ def depthwise_kernel(op: Operation, dpu: Dpu) -> Finding | None:
 
     Their product is at most {depthwise[window_max]} ({depthwise[window_max].source}).
     """
-    kernel = op.kernel
     limit = dpu.limit("depthwise", "kernel")
     most = dpu.whole("depthwise", "window_max")
-    if not outside(kernel, limit) and kernel[0] * kernel[1] <= most:
+    if not outside(op.kernel, limit) and op.kernel_area <= most:
         return None
-    reason = f"kernel ({shown(kernel)}) is not in the DPU's range {limit}, area at most {most}"
+    reason = f"kernel ({shown(op.kernel)}) is not in the DPU's range {limit}, area at most {most}"
     return Finding(reason, "use a smaller kernel, or a k x 1 and a 1 x k depthwise convolution")
 
 

@@ -158,7 +158,7 @@ def forms(op: Operation, dpu: Dpu) -> Iterator[Operation]:
     yield op
     # An NPU's file does not state the array that it would fit.
     if "array" in dpu.tables and fully_connected(op):
-        values = math.prod(op.in_shapes[0] or ())
+        values = math.prod(op.in_shape or ())
         outputs = min(op.channels[1], dpu.channels_max)
         part = replace(op, channels=(op.channels[0], outputs), out_shape=(outputs, 1, 1))
         yield part
@@ -175,11 +175,10 @@ def fully_connected(op: Operation) -> bool:
     """Return True if an operation is a fully connected layer: a convolution whose kernel is as
     large as its input, without pads and dilations, so that its result has one pixel.
     """
-    shape = op.in_shapes[0] if op.in_shapes else None
     return (
         op.kind == "conv"
-        and shape is not None
-        and op.kernel == shape[1:]
+        and op.in_shape is not None
+        and op.kernel == op.in_shape[1:]
         and op.window.dilations == (1, 1)
         and not any(op.window.pads)
     )

@@ -278,7 +278,7 @@ def resize_scale(op: Operation, dpu: Dpu) -> Finding | None:
 
     With half-pixel centres {resize[half_pixel_scale]} ({resize[half_pixel_scale].source}).
     """
-    before = op.in_shapes[0] if op.in_shapes else None
+    before = op.in_shape
     after = op.out_shape
     if op.attributes.get("mode") != "linear" or before is None or after is None:
         return None
@@ -309,11 +309,10 @@ def map_exists(op: Operation, dpu: Dpu) -> Finding | None:
     """The tile is large enough for every window: each map keeps at least one pixel (ONNX 1.17, Conv
     and MaxPool).
     """
-    before = op.in_shapes[0] if op.in_shapes else None
-    if op.kind not in WINDOWED or before is None or op.out_shape is not None:
+    if op.kind not in WINDOWED or op.in_shape is None or op.out_shape is not None:
         return None
     window = f"a kernel of {shown(op.kernel)}, stride {shown(op.window.strides)}"
-    reason = f"nothing is left of a map of {shown(before[1:])} under {window}"
+    reason = f"nothing is left of a map of {shown(op.in_shape[1:])} under {window}"
     return Finding(reason, "use a larger tile, or fewer strides before it")
 
 

@@ -281,25 +281,17 @@ def _subgraphs(operations: tuple[Operation, ...], devices: list[Device]) -> list
         steps = [changes + (was_on_dpu != on_dpu) for was_on_dpu, changes in levels]
         level = (on_dpu, max(steps, default=0))
         depth |= dict.fromkeys(op.outputs, level)
-        for name in (*(name for name in op.inputs if depth.get(name) == level), *op.outputs):
-            parents[_root(parents, name)] = _root(parents, op.output)
+        for name in (*op.outputs, *(name for name in op.inputs if depth.get(name) == level)):
+            parents[_root(parents, op.output)] = _root(parents, name)
     numbers: dict[str, int] = {}
     return [numbers.setdefault(_root(parents, op.output), len(numbers)) for op in operations]
 
 
 def _root(parents: dict[str, str], name: str) -> str:
-    """Return the tensor that represents the subgraph of `name` (union-find with path
-    compression).
-    """
-    root = name
-    while parents.get(root, root) != root:
-        root = parents[root]
-    # Path compression: without it, each node of a long chain would follow all of it again.
-    while name != root:
-        parent = parents[name]
-        parents[name] = root
-        name = parent
-    return root
+    """Return the tensor that represents the subgraph of `name` (union-find)."""
+    while parents.get(name, name) != name:
+        name = parents[name]
+    return name
 
 
 def _cuts(network: SizedGraph, nodes: Iterable[PlacedNode]) -> Iterable[Cut]:

@@ -144,16 +144,12 @@ def _array_operations(op: Operation, dpu: Dpu) -> int:
 
 
 def _lane_steps(op: Operation, dpu: Dpu) -> int:
-    if (
-        op.kind not in ("depthwise", "pool", "add", "mul")
-        or not op.in_shapes
-        or op.in_shapes[0] is None
-    ):
+    if op.kind not in ("depthwise", "pool", "add", "mul") or op.in_shape is None:
         return 0
     # A depthwise convolution with several results a channel passes over its map for each of them.
     passes = max(op.channels[1] // max(op.channels[0], 1), 1) if op.kind == "depthwise" else 1
-    taps = op.kernel[0] * op.kernel[1] * passes
-    channels = _up(op.in_shapes[0][0], dpu.whole("elementwise", "channels_per_cycle"))
+    taps = op.kernel_area * passes
+    channels = _up(op.in_shape[0], dpu.whole("elementwise", "channels_per_cycle"))
     rows = min(dpu.whole("elementwise", "pixels_per_cycle"), dpu.whole("array", "pixel_parallel"))
     return taps * channels * _positions(op.out_shape, rows)
 
@@ -262,10 +258,9 @@ class _Flow:
         """
         pieces: dict[str, int] = {}
         for op in operations:
-            in_shape = next(iter(op.in_shapes), None)
             root = self._root(op.output)
-            if op.kind == "pixel shuffle" and in_shape and op.out_shape and self._readers[root]:
-                pieces[root] = min(in_shape[0], op.out_shape[0])
+            if op.kind == "pixel shuffle" and op.in_shape and op.out_shape and self._readers[root]:
+                pieces[root] = min(op.in_shape[0], op.out_shape[0])
             if op.kind == "concat":
                 fed = zip(op.inputs, op.in_shapes, strict=True)
                 pieces |= {self._root(name): shape[0] for name, shape in fed if shape is not None}
