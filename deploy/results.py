@@ -202,7 +202,10 @@ class Table:
             "schema_version": SCHEMA_VERSION,
             "tool_version": __version__,
             "command": self.command,
-            "arguments": {key: _plain(value) for key, value in self.arguments.items()},
+            "arguments": {
+                key: value if isinstance(value, str | int | float | None) else str(value)
+                for key, value in self.arguments.items()
+            },
             "inputs": [item._asdict() for item in inputs],
             "host": host(),
             **({"verdict": verdict, "checks": checks} if checks else {}),
@@ -335,7 +338,3 @@ def _encodable(value: object) -> object:
     if isinstance(value, list):
         return [_encodable(item) for item in value]
     return encodable(value) if isinstance(value, str) else value
-
-
-def _plain(value: object) -> object:
-    return value if isinstance(value, str | int | float | bool | type(None)) else str(value)

@@ -172,28 +172,18 @@ def _sensor_rows(sensor: Sensor) -> list[Row]:
     for table in TABLES:
         constants = [(f"{table}.{key}", getattr(sensor, key)) for key in constant_keys(table)]
         rows += [_row(key, constant) for key, constant in constants if constant is not None]
-        rows += _response(sensor) if table == "mtf" else []
+        response = sensor.response
+        if table != "mtf" or response is None:
+            continue
+        # The MTF is a measured table, or follows from parts of a point-spread function.
+        texts = {"psf": str(response)}
+        if isinstance(response, MtfTable):
+            columns = ("frequency", "across", "along")
+            texts = {key: ", ".join(f"{v:g}" for v in getattr(response, key)) for key in columns}
+        words = {"status": sensor.mtf_nyquist.status, "source": sensor.mtf_nyquist.source}
+        for key, text in texts.items():
+            rows.append(Row("constants", f"mtf.{key}", {}, {"value": text, **words}))
     return rows + _table_rows(sensor.effects)
-
-
-def _response(sensor: Sensor) -> list[Row]:
-    """Return the rows of a sensor's MTF: a measured table, or parts of a point-spread function."""
-    response = sensor.response
-    words = {"status": sensor.mtf_nyquist.status, "source": sensor.mtf_nyquist.source}
-    if response is None:
-        return []
-    if not isinstance(response, MtfTable):
-        return [Row("constants", "mtf.psf", {}, {"value": str(response), **words})]
-    columns = {"frequency": response.frequency, "across": response.across, "along": response.along}
-    return [
-        Row(
-            "constants",
-            f"mtf.{key}",
-            {},
-            {"value": ", ".join(f"{v:g}" for v in values), **words},
-        )
-        for key, values in columns.items()
-    ]
 
 
 def _table_rows(tables: Mapping[str, Mapping[str, Constant | Words]]) -> list[Row]:

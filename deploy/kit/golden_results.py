@@ -45,7 +45,18 @@ def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[st
     golden = read_golden(Path(folder))
     results_folder = Path(results)
     outputs = _errors(golden, results_folder)
-    rows = tuple(_row(golden.core, name, errors) for name, errors in outputs.items())
+    rows = []
+    for name, errors in outputs.items():
+        values = sum(error.size for error in errors)
+        source = f"{len(errors)} cases, {values} values, against the integer reference"
+        differing = 100 * sum(map(np.count_nonzero, errors)) / values
+        largest = max(int(error.max()) for error in errors)
+        figures = {
+            "differing": measured(differing, "%", source),
+            "at most by": measured(largest, "LSB", source),
+        }
+        worst = max(errors, key=np.count_nonzero)
+        rows.append(Row("golden", _layer(golden.core, name), figures, {"where": where(worst > 0)}))
     wrong = [name for name, errors in outputs.items() if any(error.any() for error in errors)]
     detail = ""
     if wrong:
@@ -55,7 +66,7 @@ def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[st
     return Table(
         title=f"{results_folder.name} against {Path(folder).name}",
         inputs=(golden.network, Path(folder) / INDEX),
-        rows=rows,
+        rows=tuple(rows),
         checks=(Check("layers that differ", len(wrong), 0, "layer", detail=detail),),
         notes=() if wrong else (f"no layer differs: {len(rows)} compared",),
         headings={"golden": "layers"},
@@ -137,19 +148,6 @@ def _unseen_before(core: IntCore, name: str, outputs: Collection[str]) -> int:
             needed |= set(op.inputs)
             count += op.output != name
     return count
-
-
-def _row(core: IntCore, name: str, errors: list[np.ndarray]) -> Row:
-    """Return the share and size of the differences of a layer, and where they lie."""
-    values = sum(error.size for error in errors)
-    source = f"{len(errors)} cases, {values} values, against the integer reference"
-    differing = sum(map(np.count_nonzero, errors))
-    figures = {
-        "differing": measured(100 * differing / values, "%", source),
-        "at most by": measured(max(int(error.max()) for error in errors), "LSB", source),
-    }
-    worst = max(errors, key=np.count_nonzero)
-    return Row("golden", _layer(core, name), figures, {"where": where(worst > 0)})
 
 
 def where(differs: np.ndarray) -> str:

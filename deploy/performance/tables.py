@@ -12,11 +12,7 @@ from itertools import product
 
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.cost.host import Task
-from beers_deploy.dpu.cost.latency import (
-    LayerCost,
-    Prediction,
-    dpu_power,
-)
+from beers_deploy.dpu.cost.latency import Prediction, dpu_power
 from beers_deploy.dpu.cost.model import between
 from beers_deploy.network import NetworkLike
 from beers_deploy.performance.swath import (
@@ -160,29 +156,26 @@ def layer_rows(prediction: Prediction) -> list[Row]:
     The columns are those of AMD's profiler vaitrace, and a text "bound" with the longest part of
     the layer's time. Times are those of a batch, bytes of feature maps those of one image.
     """
-    rows = [_layer_row(layer, prediction) for layer in prediction.layers]
-    total = f"sum: one batch of {prediction.batch}"
-    time = scaled(1e3 * prediction.batch_time_s, "ms/batch", prediction)
-    return [*rows, Row(LAYERS, total, {"time": time})]
-
-
-def _layer_row(layer: LayerCost, prediction: Prediction) -> Row:
-    work = layer.work
+    rows = []
     batch = prediction.batch
-    moved_bytes = batch * work.map_bytes + work.weight_bytes
-    # A concat takes no time of its own: over an infinite time its rates are 0.
-    seconds = layer.time_s or math.inf
-    figures = {
-        "work": exact(work.operations / 1e9, "GOP"),
-        "time": scaled(1e3 * layer.time_s, "ms/batch", prediction),
-        "rate": scaled(batch * work.operations / seconds / 1e9, "GOP/s", prediction),
-        "LdFM": _moved(work.load_map_bytes, "feature maps that an image loads"),
-        "LdWB": _moved(work.weight_bytes, "weights and biases that a batch loads"),
-        "StFM": _moved(work.store_map_bytes, "feature maps that an image stores"),
-        "bandwidth": scaled(moved_bytes / seconds / 1e9, "GB/s", prediction),
-        "array use": exact(100 * work.array_use, "%"),
-    }
-    return Row(LAYERS, work.name, figures, {"bound": layer.bound})
+    for layer in prediction.layers:
+        work = layer.work
+        moved_bytes = batch * work.map_bytes + work.weight_bytes
+        # A concat takes no time of its own: over an infinite time its rates are 0.
+        seconds = layer.time_s or math.inf
+        figures = {
+            "work": exact(work.operations / 1e9, "GOP"),
+            "time": scaled(1e3 * layer.time_s, "ms/batch", prediction),
+            "rate": scaled(batch * work.operations / seconds / 1e9, "GOP/s", prediction),
+            "LdFM": _moved(work.load_map_bytes, "feature maps that an image loads"),
+            "LdWB": _moved(work.weight_bytes, "weights and biases that a batch loads"),
+            "StFM": _moved(work.store_map_bytes, "feature maps that an image stores"),
+            "bandwidth": scaled(moved_bytes / seconds / 1e9, "GB/s", prediction),
+            "array use": exact(100 * work.array_use, "%"),
+        }
+        rows.append(Row(LAYERS, work.name, figures, {"bound": layer.bound}))
+    time = scaled(1e3 * prediction.batch_time_s, "ms/batch", prediction)
+    return [*rows, Row(LAYERS, f"sum: one batch of {batch}", {"time": time})]
 
 
 def _moved(size_bytes: int, what: str) -> Figure:

@@ -109,7 +109,34 @@ class Report:
 
 def render(report: Report) -> str:
     """Render a report as the text of one HTML file, with its pictures embedded."""
-    tables = [_grid(table, upright=report.sorts) for table in report.tables]
+    tables = []
+    for table in report.tables:
+        rows = list(table.rows)
+        figures = columns_of(rows)
+        words = words_of(rows)
+        columns = [_head(column.name, column.unit) for column in figures]
+        columns += [_head(word, word=True) for word in words]
+        cells = []
+        for row in rows:
+            line = [_cell(row.figures.get(column.name)) for column in figures]
+            for word in words:
+                text = row.text.get(word, "")
+                line.append({"text": text, "mode": "word", "title": "", "value": text})
+            cells.append(line)
+        sides = [columns, [_head(row.name) for row in rows]]
+        if not report.sorts and len(columns) > max(WIDE, len(rows)):
+            # Columns that do not fit on a page are turned into rows, because a page is open
+            # downwards.
+            sides.reverse()
+            cells = [list(line) for line in zip(*cells, strict=True)]
+        grid = {
+            "title": table.title,
+            "caption": table.caption,
+            "header": sides[0],
+            "lines": list(zip(sides[1], cells, strict=True)),
+            "missing": missing(rows),
+        }
+        tables.append(grid)
     return template("report.html").render(report=report, tables=tables, version=__version__)
 
 
@@ -118,40 +145,8 @@ def write_report(report: Report, path: Path) -> None:
     write_text(path, render(report))
 
 
-def _grid(table: Section, *, upright: bool) -> dict[str, object]:
-    """Return header and lines of a table. Rows and columns are swapped if that fits the page
-    better, unless `upright`.
-    """
-    rows = list(table.rows)
-    figures = columns_of(rows)
-    words = words_of(rows)
-    columns = [_head(column.name, column.unit) for column in figures]
-    columns += [_head(word, word=True) for word in words]
-    cells = []
-    for row in rows:
-        line = [_cell(row.figures.get(column.name)) for column in figures]
-        line += [_word(row.text.get(word, "")) for word in words]
-        cells.append(line)
-    sides = [columns, [_head(row.name) for row in rows]]
-    if not upright and len(columns) > max(WIDE, len(rows)):
-        # Columns that do not fit on a page are turned into rows, because a page is open downwards.
-        sides.reverse()
-        cells = [list(line) for line in zip(*cells, strict=True)]
-    return {
-        "title": table.title,
-        "caption": table.caption,
-        "header": sides[0],
-        "lines": list(zip(sides[1], cells, strict=True)),
-        "missing": missing(rows),
-    }
-
-
 def _head(name: str, unit: str = "", word: bool = False) -> dict[str, str]:
     return {"text": name, "unit": unit, "mode": "word" if word else ""}
-
-
-def _word(text: str) -> dict[str, str]:
-    return {"text": text, "mode": "word", "title": "", "value": text}
 
 
 def _cell(figure: Figure | None) -> dict[str, str]:

@@ -8,7 +8,6 @@ import base64
 import io
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from markupsafe import Markup
 from PIL import Image
@@ -16,7 +15,7 @@ from PIL import Image
 from beers_deploy import __version__
 from beers_deploy.model.io.files import write_text
 from beers_deploy.report.page import template
-from beers_deploy.report.view_layers import SELF_CHECK, Layer, layers_of
+from beers_deploy.report.view_layers import SELF_CHECK, layers_of
 
 TILE_PX = 512
 QUALITY = 90
@@ -39,10 +38,24 @@ def write_view(
         trusted: True if `image` may be an index (such as a VRT) of files outside its folder.
     """
     layers, notes = layers_of(image, restored, maps, trusted)
+    raw = layers[0]
+    described = []
+    for layer in layers:
+        height, width = layer.pixels.shape[:2]
+        facts = {
+            "name": layer.name,
+            "width": width,
+            "height": height,
+            # In widths of the raw image as it is shown.
+            "across": width * layer.pixel_px / (raw.pixels.shape[1] * raw.pixel_px),
+            "legend": layer.legend,
+            "tiles": pyramid(Image.fromarray(layer.pixels)),
+        }
+        described.append(facts)
     page = template("view.html").render(
         title=f"{image.name}, raw and restored",
         notes=notes,
-        layers=[_described(layer, layers[0]) for layer in layers],
+        layers=described,
         overlay=SELF_CHECK,
         quality=QUALITY,
         version=__version__,
@@ -50,20 +63,6 @@ def write_view(
         viewer=Markup((VIEWER / "openseadragon.min.js").read_text(encoding="utf-8")),  # noqa: S704
     )
     write_text(path, page)
-
-
-def _described(layer: Layer, raw: Layer) -> dict[str, Any]:
-    """Return the description of a layer for the page's script."""
-    height, width = layer.pixels.shape[:2]
-    return {
-        "name": layer.name,
-        "width": width,
-        "height": height,
-        # In widths of the raw image as it is shown.
-        "across": width * layer.pixel_px / (raw.pixels.shape[1] * raw.pixel_px),
-        "legend": layer.legend,
-        "tiles": pyramid(Image.fromarray(layer.pixels)),
-    }
 
 
 def pyramid(picture: Image.Image) -> list[list[list[str]]]:
@@ -79,23 +78,22 @@ def pyramid(picture: Image.Image) -> list[list[list[str]]]:
     levels = [picture]
     while max(levels[0].size) > TILE_PX:
         levels.insert(0, levels[0].reduce(2))
-    return [_tiles(level) for level in levels]
-
-
-def _tiles(level: Image.Image) -> list[list[str]]:
-    width, height = level.size
-    rows = []
-    for top in range(0, height, TILE_PX):
-        bottom = min(top + TILE_PX, height)
-        row = []
-        for left in range(0, width, TILE_PX):
-            right = min(left + TILE_PX, width)
-            buffer = io.BytesIO()
-            # JPEG has no opacity.
-            kind = "png" if level.mode == "RGBA" else "jpeg"
-            tile = level.crop((left, top, right, bottom))
-            tile.save(buffer, kind, quality=QUALITY, subsampling=0)
-            content = base64.b64encode(buffer.getvalue()).decode()
-            row.append(f"data:image/{kind};base64,{content}")
-        rows.append(row)
-    return rows
+    tiles = []
+    for level in levels:
+        width, height = level.size
+        rows = []
+        for top in range(0, height, TILE_PX):
+            bottom = min(top + TILE_PX, height)
+            row = []
+            for left in range(0, width, TILE_PX):
+                right = min(left + TILE_PX, width)
+                buffer = io.BytesIO()
+                # JPEG has no opacity.
+                kind = "png" if level.mode == "RGBA" else "jpeg"
+                tile = level.crop((left, top, right, bottom))
+                tile.save(buffer, kind, quality=QUALITY, subsampling=0)
+                content = base64.b64encode(buffer.getvalue()).decode()
+                row.append(f"data:image/{kind};base64,{content}")
+            rows.append(row)
+        tiles.append(rows)
+    return tiles

@@ -201,22 +201,17 @@ def _map_layer(name: str, source: Source, raw: Raster) -> Layer:
         # The planes are chi2 and state of each band that was checked.
         states = read_planes(source, range(1, raster.bands, 2), 1)
         times = max(1, BLOCK_PX // (SHARP_PX * reduction(raw)))
-        shown = _blocks(states).repeat(times, axis=0).repeat(times, axis=1)
+        picture = np.zeros((*states.shape[1:], 4), np.uint8)
+        # The worst state of all bands counts. A block that no band has a state for stays clear.
+        for state in (SMOOTH, WITHIN, OUTSIDE):
+            colour = bytes.fromhex(STATES[state][0].removeprefix("#"))
+            picture[(states == state).any(axis=0)] = (*colour, BLOCK_ALPHA)
+        shown = picture.repeat(times, axis=0).repeat(times, axis=1)
         return Layer(name, shown, BLOCK_PX / times, tuple(STATES.values()))
     (plane,) = read_planes(source, range(1), reduction(raster))
     stretch = Stretch(0, float(np.percentile(_sample(plane), STRETCH[1])))
     shown = _stretched(plane[None], [stretch])
     return Layer(name, shown, _pixel_px(raster, raw), _ends([stretch], _unit(raster)))
-
-
-def _blocks(states: Planes) -> Pixels:
-    """Return the states (bands, n, m) of blocks as colours. The worst state of all bands counts."""
-    picture = np.zeros((*states.shape[1:], 4), np.uint8)
-    # A block that no band has a state for stays clear.
-    for state in (SMOOTH, WITHIN, OUTSIDE):
-        colour = bytes.fromhex(STATES[state][0].removeprefix("#"))
-        picture[(states == state).any(axis=0)] = (*colour, BLOCK_ALPHA)
-    return picture
 
 
 def _pixel_px(raster: Raster, raw: Raster) -> float:

@@ -71,25 +71,22 @@ class HalfWidths:
         Returns:
             Half-widths in pixel values, (rows, width) float32, NaN where a pixel is missing.
         """
-        parts = [
-            self._strip(band, start + top, start + bottom)
-            for top, bottom in strips(stop - start, ROWS_PX)
-        ]
+        raster = self.source.raster
+        parts = []
+        for first, end in strips(stop - start, ROWS_PX):
+            top = max(start + first - CONTEXT_PX, 0)
+            bottom = min(start + end + CONTEXT_PX, raster.height_px)
+            pixels = self.restored(band, top, bottom)
+            valid = np.ones(pixels.shape, bool)
+            if raster.may_miss:
+                valid = ~raster.missing(self.source.read(top, bottom))[band]
+            widths = self.bands[band].of(pixels, valid)
+            parts.append(widths[start + first - top : start + end - top])
         return np.concatenate(parts)
 
     def read_mask(self, start: int, stop: int) -> np.ndarray:
         """Return rows `start` to `stop` (excluded) of the mask of the raw image, (rows, width)."""
         return self.source.read_mask(start, stop)
-
-    def _strip(self, band: int, start: int, stop: int) -> np.ndarray:
-        raster = self.source.raster
-        top = max(start - CONTEXT_PX, 0)
-        bottom = min(stop + CONTEXT_PX, raster.height_px)
-        pixels = self.restored(band, top, bottom)
-        valid = np.ones(pixels.shape, bool)
-        if raster.may_miss:
-            valid = ~raster.missing(self.source.read(top, bottom))[band]
-        return self.bands[band].of(pixels, valid)[start - top : stop - top]
 
 
 def require_sensors(sensors: Mapping[str, Sensor]) -> None:

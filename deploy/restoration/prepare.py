@@ -329,11 +329,14 @@ def seam_figures(source: Source, plan: Plan, restorer: Restorer) -> dict[str, Fi
         return dict.fromkeys(keys, unavailable("DN", reason))
     rows = plan.rows[len(plan.rows) // 2]
     columns = plan.columns[len(plan.columns) // 2]
-    ends_px = plan.rows[-1].stop, plan.columns[-1].stop
-    wide = [
-        _widened(span, plan.radius_px, end_px)
-        for span, end_px in zip((rows, columns), ends_px, strict=True)
-    ]
+    wide = []
+    # The whole radius around the same retained pixels, as far as the image and its extension reach.
+    for span, end_px in ((rows, plan.rows[-1].stop), (columns, plan.columns[-1].stop)):
+        start = max(span.keep_start - plan.radius_px, 0)
+        stop = min(span.keep_stop + plan.radius_px, end_px)
+        # The retained part ends on the network's lattice or with the image.
+        stop = end_px if span.stop == end_px else stop
+        wide.append(Span(start, stop, span.keep_start, span.keep_stop))
     # A last tile that was moved inward may begin before the wider window.
     top = min(rows.start, wide[0].start)
     strip = restorer.read(source, replace(rows, start=top, stop=max(rows.stop, wide[0].stop)))
@@ -347,19 +350,6 @@ def seam_figures(source: Source, plan: Plan, restorer: Restorer) -> dict[str, Fi
         key: measured(float(value), "DN", how)
         for key, value in zip(keys, (error.max(), error.mean()), strict=True)
     }
-
-
-def _widened(span: Span, radius_px: int, size_px: int) -> Span:
-    """Return a span of the same retained pixels with the whole radius around them, as far as the
-    image and its extension reach.
-
-    The retained part ends on the network's lattice or with the image. In the second case the span
-    that is read ends with the extension.
-    """
-    start = max(span.keep_start - radius_px, 0)
-    stop = min(span.keep_stop + radius_px, size_px)
-    stop = size_px if span.stop == size_px else stop
-    return Span(start, stop, span.keep_start, span.keep_stop)
 
 
 def check_sensor(

@@ -170,23 +170,17 @@ def check_result(source: Source, read: ReadRows, checks: Mapping[int, SelfCheck]
             for band, check in checks.items():
                 raw = np.where(missing[band], np.nan, stored[band]).astype(np.float32)
                 restored = read(band, top, bottom).astype(np.float32)
-                judged[band].append(_judge_rows(check, raw, restored, down))
+                parts = []
+                # Window by window, which bounds the memory.
+                for first, end in strips(raster.width_px, COLUMNS_PX):
+                    left = max(first - REACH_PX, 0)
+                    right = min(end + REACH_PX, raster.width_px)
+                    across = Placed(raster.width_px, left, first, end)
+                    columns = slice(left, right)
+                    parts.append(check.judge(raw[:, columns], restored[:, columns], down, across))
+                judged[band].append(_joined(parts, axis=1))
             bar.advance()
     return BlockMap({band: _joined(parts, axis=0) for band, parts in judged.items()})
-
-
-def _judge_rows(check: SelfCheck, raw: np.ndarray, restored: np.ndarray, down: Placed) -> Judged:
-    """Compare restored rows (h, width) with raw ones window by window, which bounds the memory.
-    `down` states where the rows lie in the image.
-    """
-    width = raw.shape[1]
-    parts = []
-    for start, stop in strips(width, COLUMNS_PX):
-        left = max(start - REACH_PX, 0)
-        right = min(stop + REACH_PX, width)
-        across = Placed(width, left, start, stop)
-        parts.append(check.judge(raw[:, left:right], restored[:, left:right], down, across))
-    return _joined(parts, axis=1)
 
 
 def _joined(parts: Sequence[Judged], axis: int) -> Judged:

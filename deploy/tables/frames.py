@@ -14,15 +14,6 @@ if TYPE_CHECKING:
 COLOURS = {"measured": "tab:green", "predicted": "tab:orange", "published": "tab:blue"}
 
 
-def _index(rows: Sequence[Row]) -> Any:
-    pandas = optional("pandas", "to_pandas")
-    if len({row.table for row in rows}) > 1:
-        return pandas.MultiIndex.from_tuples(
-            [(row.table, row.name) for row in rows], names=["table", "name"]
-        )
-    return pandas.Index([row.name for row in rows], name=rows[0].table if rows else "name")
-
-
 def wide_frame(rows: Sequence[Row]) -> "pd.DataFrame":
     """Convert rows to a pandas DataFrame with a line for each row; see `results.Table.to_pandas`.
 
@@ -43,8 +34,12 @@ def wide_frame(rows: Sequence[Row]) -> "pd.DataFrame":
     for column in columns:
         figures = [row.figures.get(column.name) for row in rows]
         values[column.name] = [figure and figure.value for figure in figures]
+    index = pandas.Index([row.name for row in rows], name=rows[0].table if rows else "name")
+    if len({row.table for row in rows}) > 1:
+        pairs = [(row.table, row.name) for row in rows]
+        index = pandas.MultiIndex.from_tuples(pairs, names=["table", "name"])
     # As floats, figures that are missing are NaN.
-    frame: pd.DataFrame = pandas.DataFrame(values, index=_index(rows), dtype=float)
+    frame: pd.DataFrame = pandas.DataFrame(values, index=index, dtype=float)
     for word in words_of(rows):
         # A word of a figure's name would replace the figure.
         if word not in values:

@@ -9,8 +9,8 @@ Several layouts are tried, and the first that fits is printed:
 """
 
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
-from itertools import chain
+from collections.abc import Iterable, Sequence
+from itertools import chain, product
 
 from rich import box
 from rich.cells import cell_len
@@ -57,7 +57,10 @@ def print_rows(title: str, rows: Iterable[Row], console: Console) -> None:
     """
     table_rows = list(rows)
     console.print(plain(title), style="bold", highlight=False)
-    for layout in _layouts(table_rows):
+    down = len(columns_of(table_rows)) > len(table_rows)
+    for by_figure, stacked in product((down, not down), (False, True)):
+        build = _by_figure if by_figure else _by_row
+        layout = build(table_rows, stacked)
         if _fits(layout, console):
             console.print(layout)
             break
@@ -66,14 +69,6 @@ def print_rows(title: str, rows: Iterable[Row], console: Console) -> None:
     for reason in missing(table_rows):
         console.print(plain(f"- {reason}"), style="dim", highlight=False, soft_wrap=True)
     console.print()
-
-
-def _layouts(rows: Sequence[Row]) -> Iterator[Table]:
-    """Yield a table in every layout, the best first."""
-    down = len(columns_of(rows)) > len(rows)
-    for by_figure in (down, not down):
-        for stacked in (False, True):
-            yield _by_figure(rows, stacked) if by_figure else _by_row(rows, stacked)
 
 
 def _fits(table: Table, console: Console) -> bool:

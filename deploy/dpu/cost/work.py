@@ -196,7 +196,16 @@ class _Flow:
             self._readers.update(sources)
         self._shapes = {op.output: op.out_shape for op in computing}
         self._concats = {op.output for op in computing if op.kind == "concat"}
-        self._pieces = self._piece_channels(operations)
+        # The number of contiguous channels of a pixel, by result. A pixel shuffle at the end of a
+        # network is left to the host.
+        self._pieces: dict[str, int] = {}
+        for op in operations:
+            root = self._root(op.output)
+            if op.kind == "pixel shuffle" and op.in_shape and op.out_shape and self._readers[root]:
+                self._pieces[root] = min(op.in_shape[0], op.out_shape[0])
+            if op.kind == "concat":
+                fed = zip(op.inputs, op.in_shapes, strict=True)
+                self._pieces |= {self._root(name): shape[0] for name, shape in fed if shape}
         sums = [op for op in computing if op.kind in ("add", "mul")]
         inputs = chain.from_iterable(op.inputs for op in computing if op.kind == "concat")
         self._stored = {self._root(name) for name in inputs}
@@ -251,20 +260,6 @@ class _Flow:
         piece = self._pieces.get(name)
         # Pieces lie apart in memory: each takes whole bursts.
         return size // piece * _up(piece, BURST_BYTES) if piece else size
-
-    def _piece_channels(self, operations: Sequence[Operation]) -> dict[str, int]:
-        """Return the number of contiguous channels of a pixel, by result. A pixel shuffle at the
-        end of a network is left to the host.
-        """
-        pieces: dict[str, int] = {}
-        for op in operations:
-            root = self._root(op.output)
-            if op.kind == "pixel shuffle" and op.in_shape and op.out_shape and self._readers[root]:
-                pieces[root] = min(op.in_shape[0], op.out_shape[0])
-            if op.kind == "concat":
-                fed = zip(op.inputs, op.in_shapes, strict=True)
-                pieces |= {self._root(name): shape[0] for name, shape in fed if shape is not None}
-        return pieces
 
     def _fused(self, add: Operation) -> str:
         """Return the operand of an add that is computed last."""

@@ -84,7 +84,13 @@ def look_at_detectors(source: Source, full_scale: float = np.inf) -> tuple[BandF
     raster = source.raster
     steps = value_steps(source)
     strips: list[list[StripLook]] = [[] for _ in steps]
-    for top, stop in _strips(raster.height_px, raster.width_px, raster.bands):
+    rows_px = max(LOOKED_PX // (raster.width_px * raster.bands), LEAST_ROWS_PX)
+    rows_px = min(raster.height_px, rows_px)
+    side_px = min(STRIP_PX, max(LEAST_STRIP_PX, rows_px // BLOCKS), raster.height_px)
+    for place in np.linspace(0, raster.height_px - side_px, max(rows_px // side_px, 1)):
+        # The patterns have a period of 2: strips that begin on even rows share its phase.
+        top = int(place) // 2 * 2
+        stop = top + side_px
         start = max(top - MARGIN_PX, 0)
         end = min(stop + MARGIN_PX, raster.height_px)
         within = slice(top - start, stop - start)
@@ -123,17 +129,6 @@ def value_steps(source: Source) -> list[float]:
     top = raster.height_px // 2
     rows = np.ma.getdata(source.read(top, min(top + LEAST_STRIP_PX, raster.height_px)))
     return [float(max(int(np.gcd.reduce(band.astype(np.int64), axis=None)), 1)) for band in rows]
-
-
-def _strips(height_px: int, width_px: int, bands: int) -> Iterator[tuple[int, int]]:
-    """Yield the first row and the end (excluded) of each strip. First rows are even."""
-    rows_px = min(height_px, max(LOOKED_PX // (width_px * bands), LEAST_ROWS_PX))
-    side_px = min(STRIP_PX, max(LEAST_STRIP_PX, rows_px // BLOCKS))
-    side_px = min(side_px, height_px)
-    for top in np.linspace(0, height_px - side_px, max(rows_px // side_px, 1)):
-        # The patterns have a period of 2: strips that begin on even rows share its phase.
-        even = int(top) // 2 * 2
-        yield even, even + side_px
 
 
 StripLook = tuple[Blocks, Blocks, range, list[tuple[np.ndarray, np.ndarray]], np.ndarray, int]

@@ -130,9 +130,19 @@ class Measurement:
                 "too high"
             )
         if not model.white:
+            cause = (
+                "Unequal readout channels or interference cause this: equalise the frames first, "
+                "or a restoration smooths more than it need"
+            )
+            # A restoration assumes white noise.
+            if model.colour > 1:
+                cause = (
+                    "Filtering or compression after the detector causes this: a restoration leaves "
+                    "grain of some pixels' size"
+                )
             yield (
                 f"the noise is not white: at middle frequencies it is {model.colour:.2f} times as "
-                f"strong as at the finest. {_colour_consequence(model.colour)}"
+                f"strong as at the finest. The profile states the stronger part. {cause}"
             )
         if model.one_level:
             yield (
@@ -154,21 +164,6 @@ class Measurement:
                 "the profile's MTF is an assumption: state what you know as `mtf`, or point at "
                 "straight edges as `edge` FILE:X,Y,WIDTH,HEIGHT"
             )
-
-
-def _colour_consequence(colour: float) -> str:
-    """Return the consequence of noise that is not white for a restoration, which assumes white
-    noise.
-    """
-    if colour > 1:
-        return (
-            "The profile states the stronger part. Filtering or compression after the detector "
-            "causes this: a restoration leaves grain of some pixels' size"
-        )
-    return (
-        "The profile states the stronger part. Unequal readout channels or interference cause "
-        "this: equalise the frames first, or a restoration smooths more than it need"
-    )
 
 
 def _blocks(noise: Noise) -> str:

@@ -8,6 +8,7 @@ on a grey letterbox, and return px of the input.
 """
 
 import ast
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -146,8 +147,14 @@ def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> D
         OptionError: `size_px` contradicts the file, or is missing and the file states no size.
     """
     model = load_onnx(path)
-    # Ultralytics writes its metadata as Python literals.
-    about = {key: _literal(value) for key, value in metadata(model).items()}
+    about: dict[str, Any] = {**metadata(model)}
+    # Ultralytics writes its metadata as Python literals. A longer text is not parsed.
+    for key, text in metadata(model).items():
+        if len(text) <= LITERAL:
+            with contextlib.suppress(
+                MemoryError, RecursionError, SyntaxError, TypeError, ValueError
+            ):
+                about[key] = ast.literal_eval(text)
     names = class_names(about.get("names"))
     if not names:
         stated = repr(about["names"])[:80] if "names" in about else "none"
@@ -182,15 +189,6 @@ def _answer(session: InferenceSession, path: Path, image: np.ndarray) -> np.ndar
         raise ModelError(
             f"The detector {path} does not run: {reason}. Export it again, for one size of image."
         ) from error
-
-
-def _literal(text: str) -> Any:
-    """Return the value of a metadata entry if it is a Python literal, else the text."""
-    try:
-        # The names of 1 200 classes take half of this limit: a longer text is not parsed.
-        return ast.literal_eval(text) if len(text) <= LITERAL else text
-    except (MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
-        return text
 
 
 def _is_read(shape: Sequence[int], classes: int) -> bool:

@@ -79,7 +79,23 @@ def crops(compared: Sequence[Comparison]) -> list[Picture]:
         for number in range(len(compared[0].scenes))
     ]
     numbers = np.argsort(-np.array(losses), kind="stable")[:PICTURES]
-    return [_picture(compared, int(number)) for number in numbers]
+    sensors = " and ".join(comparison.name for comparison in compared)
+    caption = (
+        f"Rows: {sensors}. {CROP_PX} pixels of the sensor a side, enlarged {ZOOM} times, one "
+        "display for all. Boxes at the confidence of the table: green found, red missed, yellow "
+        "false."
+    )
+    pictures = []
+    for number in numbers.tolist():
+        middle = _middle(compared[0], number)
+        rows = [
+            [_cell(comparison, row, number, middle) for row in comparison.methods]
+            for comparison in compared
+        ]
+        image = np.asarray(grid(list(compared[0].methods), rows, 1))
+        title = f"{compared[0].scenes[number].scene.name}: what is found"
+        pictures.append(Picture(title, picture_url(image), caption))
+    return pictures
 
 
 def _missed_objects(comparison: Comparison, number: int) -> np.ndarray:
@@ -105,24 +121,6 @@ def _matched(
         flags[ALL, 0] for flags in match(comparison.scenes[number].scene.truth, sure)
     )
     return sure, hits, ignored, matched
-
-
-def _picture(compared: Sequence[Comparison], number: int) -> Picture:
-    middle = _middle(compared[0], number)
-    rows = [
-        [_cell(comparison, row, number, middle) for row in comparison.methods]
-        for comparison in compared
-    ]
-    sensors = " and ".join(comparison.name for comparison in compared)
-    caption = (
-        f"Rows: {sensors}. {CROP_PX} pixels of the sensor a side, enlarged {ZOOM} times, one "
-        "display for all. Boxes at the confidence of the table: green found, red missed, yellow "
-        "false."
-    )
-    image = np.asarray(grid(list(compared[0].methods), rows, 1))
-    return Picture(
-        f"{compared[0].scenes[number].scene.name}: what is found", picture_url(image), caption
-    )
 
 
 def _middle(comparison: Comparison, number: int) -> np.ndarray:

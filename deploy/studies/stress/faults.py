@@ -74,22 +74,20 @@ def as_stored(core: IntCore) -> IntCore:
     for (op, field), shift in shifts_of(core).items():
         if not -(1 << (SHIFT_BITS - 1)) <= shift < 1 << (SHIFT_BITS - 1):
             raise _refused(f"{field} {shift} at {op}")
-    return with_ops(core, map(_narrow, core.convolutions))
-
-
-def _narrow(op: IntConv) -> IntConv:
-    bias = op.bias.astype(np.int64)
-    shift = 0
-    # Bits go from the low end as long as the bias is too large for int8.
-    while (np.clip(bias >> shift, INT8_MIN, INT8_MAX) != bias >> shift).any():
-        shift += 1
-    if ((bias >> shift) << shift != bias).any():
-        raise _refused(
-            f"a bias of {int(np.abs(bias).max())} at {op.name}, finer than its size allows"
-        )
-    return replace(
-        op, bias=(bias >> shift).astype(np.int8), bias_frac_bits=op.bias_frac_bits - shift
-    )
+    narrow = []
+    for conv in core.convolutions:
+        bias = conv.bias.astype(np.int64)
+        shift = 0
+        # Bits go from the low end as long as the bias is too large for int8.
+        while (np.clip(bias >> shift, INT8_MIN, INT8_MAX) != bias >> shift).any():
+            shift += 1
+        if ((bias >> shift) << shift != bias).any():
+            raise _refused(
+                f"a bias of {int(np.abs(bias).max())} at {conv.name}, finer than its size allows"
+            )
+        stored = (bias >> shift).astype(np.int8)
+        narrow.append(replace(conv, bias=stored, bias_frac_bits=conv.bias_frac_bits - shift))
+    return with_ops(core, narrow)
 
 
 def _refused(actual: str) -> ModelError:

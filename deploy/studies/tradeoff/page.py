@@ -247,7 +247,13 @@ def draw(axes: "Axes", study: Tradeoff) -> None:
     axes.set(xscale="log", xlabel=_label(study, study.cost), ylabel=_label(study, PSNR))
     groups = list(series(study))
     for group in groups:
-        _scatter(axes, group, study)
+        # The front's marks come last, so that they lie on top.
+        points = sorted(group.points, key=lambda point: point in study.front)
+        large = [point in study.front for point in points]
+        style: dict[str, Any] = {"alpha": np.where(large, 1.0, PALE), "marker": group.marker}
+        sizes = np.where(large, FRONT_PX2, OTHERS_PX2)
+        x, y = _places(points, study.cost)
+        axes.scatter(x, y, sizes, group.colour, linewidths=0, zorder=2, **style)
     _draw_front(axes, study)
     # The points set the range: a limit outside must not widen it.
     axes.margins(0.1)
@@ -293,16 +299,6 @@ def _kind(point: Measured) -> str:
     if point.point is not None and point.point.variant.network is not None:
         return point.text["method"]
     return LIBRARIES if point.text["method"] in BASELINES else PIPELINES
-
-
-def _scatter(axes: "Axes", group: Series, study: Tradeoff) -> None:
-    # The front's marks come last, so that they lie on top.
-    points = sorted(group.points, key=lambda point: point in study.front)
-    large = [point in study.front for point in points]
-    style: dict[str, Any] = {"alpha": np.where(large, 1.0, PALE), "marker": group.marker}
-    sizes = np.where(large, FRONT_PX2, OTHERS_PX2)
-    x, y = _places(points, study.cost)
-    axes.scatter(x, y, sizes, group.colour, linewidths=0, zorder=2, **style)
 
 
 def _places(points: Sequence[Measured], cost: str) -> tuple[list[float], list[float]]:
