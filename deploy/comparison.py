@@ -20,7 +20,7 @@ from beers_deploy.profiles.sensor_numbers import numbers_of
 from beers_deploy.quant.encodings import CORE
 from beers_deploy.quant.gate import GateResult, gate_row
 from beers_deploy.quant.gate import compare as differences_of
-from beers_deploy.quant.input_range import UNIT, Ranges
+from beers_deploy.quant.input_range import UNIT
 from beers_deploy.quant.metrics import METRICS
 from beers_deploy.quant.onnx_file import faults_named, metadata, require_quantized
 from beers_deploy.quant.samples.coverage import recorded_range, uncovered
@@ -98,8 +98,19 @@ class Data:
                     ranges = int8.stated_ranges or ranges
         with faults_named(network.label):
             own = samples_of(network.model, self.samples, ranges)
-        if own is not None and int8 is not None:
-            require_in_range(own.ranges, int8)
+        # A common cause is samples in digital numbers for a network of values in [0, 1]. Networks
+        # that `quantize` did not write do not record their range, and pass.
+        if own is not None and own.ranges and int8 is not None and CORE in metadata(int8.model):
+            reads = int8.input_ranges or (UNIT,) * len(own.ranges)
+            for (low, high), (least, most) in zip(own.ranges, reads, strict=True):
+                reach = max(-low, high)
+                limit = max(-least, most)
+                if reach > MOST_BEYOND * limit:
+                    raise ImageError(
+                        f"The samples reach {reach:g}, but {int8.label} reads values up to "
+                        f"{limit:g}. Give samples in the units of the network, or quantise it "
+                        "again on samples like these."
+                    )
         return own
 
     @property
@@ -136,33 +147,6 @@ class Data:
             path = Path(self.samples)
             inputs.append(_files_input("samples", path, sample_files(path)))
         return inputs
-
-
-def require_in_range(ranges: Ranges, int8: Network) -> None:
-    """Raise ImageError if samples are far outside the range that an INT8 network reads.
-
-    A common cause is samples in digital numbers for a network of values in [0, 1]. Networks that
-    `quantize` did not write do not record their range, and pass.
-
-    Args:
-        ranges: (low, high) of the values of each channel of the samples; empty if all are in
-            [0, 1].
-        int8: the INT8 network.
-
-    Raises:
-        ImageError: a channel reaches more than MOST_BEYOND times as far as the network reads.
-    """
-    if not ranges or CORE not in metadata(int8.model):
-        return
-    reads = int8.input_ranges or (UNIT,) * len(ranges)
-    for (low, high), (least, most) in zip(ranges, reads, strict=True):
-        reach = max(-low, high)
-        limit = max(-least, most)
-        if reach > MOST_BEYOND * limit:
-            raise ImageError(
-                f"The samples reach {reach:g}, but {int8.label} reads values up to {limit:g}. Give "
-                "samples in the units of the network, or quantise it again on samples like these."
-            )
 
 
 def sensor_input(sensor: Sensor) -> Input:

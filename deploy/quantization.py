@@ -134,10 +134,14 @@ def quantized(
     require_quantized(origin.model, origin.label, expected=False)
     with faults_named(origin.label):
         if weights:
-            int8 = quantize_conditioned(
-                weights, origin, data.simulated, data.sensor, target, effort
-            )
-            return int8, None
+            # One calibration serves all sensors of the trained range. The patches of one sensor
+            # give the statistics of each layer.
+            images = [] if data.images is None else [data.images]
+            family = family_model(weights, images, data.seed, _shifts_of(target), effort=effort)
+            host = int8_for_sensor(family, data.sensor, more={"target": target.name})
+            degraded = data.simulated.drawn.degraded
+            layers = integer_rows(origin.model, read_core(host), host, degraded)
+            return Network(host, f"{weights.name}-int8", origin=origin, layers=layers), None
         # Samples in memory may be given one after the other, so they are read only here.
         source = data.own(origin) or data.simulated
         return quantize_alone(origin, source, target, steps, effort, adapts), source.unseen
@@ -206,40 +210,6 @@ def quantize_alone(
         layers=(*adapted.rows, *layers),
         quantized=result,
     )
-
-
-def quantize_conditioned(
-    network: Conditioned,
-    origin: Network,
-    calibration: "Calibration",
-    sensor: Sensor,
-    target: TargetProfile,
-    effort: Effort,
-) -> Network:
-    """Quantise a sensor-conditioned network for all sensors of the trained range.
-
-    One calibration serves all of them: the INT8 file can later be conditioned on any other sensor.
-
-    Args:
-        network: the sensor-conditioned weights.
-        origin: the float network for `sensor`.
-        calibration: its images and seed define the calibration patches of many sensors. Its own
-            patches, of one sensor, give the statistics of each layer.
-        sensor: the sensor that the result is conditioned on.
-        target: the board whose rules apply.
-        effort: the effort of the search for equalisation factors.
-
-    Returns:
-        The INT8 network for `sensor`, whose `layers` have statistics of each layer.
-
-    Raises:
-        OptionError: the target has neither a DPU nor an NPU.
-    """
-    images = [] if calibration.images is None else [calibration.images]
-    family = family_model(network, images, calibration.seed, _shifts_of(target), effort=effort)
-    host = int8_for_sensor(family, sensor, more={"target": target.name})
-    layers = integer_rows(origin.model, read_core(host), host, calibration.drawn.degraded)
-    return Network(host, f"{network.name}-int8", origin=origin, layers=layers)
 
 
 def _shifts_of(target: TargetProfile) -> Shifts:

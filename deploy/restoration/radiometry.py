@@ -44,13 +44,6 @@ class Reading:
     memory_bytes: int | None = None
     fix_detectors: str = ""
 
-    @property
-    def sensor_bits(self) -> int | None:
-        """The number of bits per pixel of the named sensors, and of several the smallest; None if
-        none is named.
-        """
-        return min((int(sensor.bits.low) for sensor in self.sensors.values()), default=None)
-
 
 @dataclass(frozen=True)
 class FullScale:
@@ -98,7 +91,8 @@ def full_scale_of(
             numbers, and neither the user nor the file states a full scale.
     """
     requested = reading.full_scale
-    bits = reading.sensor_bits
+    # Of several sensors the smallest number of bits counts.
+    bits = min((int(sensor.bits.low) for sensor in reading.sensors.values()), default=None)
     if requested is not None:
         settled_scale(name, raster.dtype, extents, requested)
         kind = raster.out_dtype

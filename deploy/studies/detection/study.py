@@ -23,7 +23,6 @@ from beers_deploy.profiles.reference import reference_beside
 from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.studies.detection.average_precision import (
     Figures,
-    Hits,
     find_hits,
     score_rows,
     site_weights,
@@ -144,7 +143,6 @@ class Comparison:
         methods: the method of each row by its name; the reference is the first row, with None.
         scenes: the scenes as the sensors acquire them.
         boxes: for each row the detections on each scene, in scene pixels.
-        hits: for each row the same detections, matched with the labelled objects.
         figures: for each row its figures by name, on all images and on each bootstrap draw.
         confidence: the confidence at which precision and recall are sampled in every row.
         names: the names of the detector's classes.
@@ -154,7 +152,6 @@ class Comparison:
     methods: Mapping[str, Method | None]
     scenes: Sequence[AcquiredScene]
     boxes: Mapping[str, Sequence[Boxes]]
-    hits: Mapping[str, Hits]
     figures: Mapping[str, Figures]
     confidence: float
     names: Sequence[str]
@@ -197,38 +194,29 @@ def run_study(
     Raises:
         OptionError: there is no such method.
     """
-    cases = []
+    cases: list[tuple[SensorPair, dict[str, Method | None]]] = []
     # A method that does not exist is refused before anything is detected.
     for profile in sensors:
         pair = SensorPair(profile, reference_beside(profile, reference))
-        rows = {name: method_named(name, pair.degraded, pair.reference) for name in methods}
-        cases.append((pair, rows))
-    return [_compared(detector, scenes, pair, rows, seed) for pair, rows in cases]
-
-
-def _compared(
-    detector: Detector,
-    scenes: Sequence[LabelledScene],
-    sensors: SensorPair,
-    methods: Mapping[str, Method],
-    seed: int,
-) -> Comparison:
-    rows = {REFERENCE: None, **methods}
-    boxes: dict[str, list[Boxes]] = {row: [] for row in rows}
-    with steps(f"detecting, {sensors.degraded.name}", len(scenes) * len(rows)) as bar:
-        # Each scene is released after its rows, because thousands would fill the memory.
-        for scene in acquired(scenes, sensors, seed):
-            for row, method in rows.items():
-                boxes[row].append(scene.boxes(detector, method))
-                bar.advance(1, row)
+        named = {name: method_named(name, pair.degraded, pair.reference) for name in methods}
+        cases.append((pair, {REFERENCE: None, **named}))
     names = detector.names
     truths = [scene.truth for scene in scenes]
-    sites = [scene.site for scene in scenes]
-    hits = {row: find_hits(truths, row_boxes, len(names)) for row, row_boxes in boxes.items()}
-    scores = score_rows(hits, names, site_weights(sites, seed))
-    return Comparison(
-        sensors, rows, list(acquired(scenes, sensors, seed)), boxes, hits, *scores, names
-    )
+    weights = site_weights([scene.site for scene in scenes], seed)
+    compared = []
+    for pair, rows in cases:
+        boxes: dict[str, list[Boxes]] = {row: [] for row in rows}
+        with steps(f"detecting, {pair.degraded.name}", len(scenes) * len(rows)) as bar:
+            # Each scene is released after its rows, because thousands would fill the memory.
+            for scene in acquired(scenes, pair, seed):
+                for row, method in rows.items():
+                    boxes[row].append(scene.boxes(detector, method))
+                    bar.advance(1, row)
+        hits = {row: find_hits(truths, row_boxes, len(names)) for row, row_boxes in boxes.items()}
+        scores = score_rows(hits, names, weights)
+        shown = list(acquired(scenes, pair, seed))
+        compared.append(Comparison(pair, rows, shown, boxes, *scores, names))
+    return compared
 
 
 def acquired(

@@ -70,7 +70,17 @@ class Evaluation(Table):
     def report(self, folder: str | os.PathLike[str]) -> Path:
         """Write report.html and its pictures into a folder, and return the path of the page."""
         page = Path(folder) / "report.html"
-        write_report(evaluation_report(self, pictures(self.pairs, self.methods, page.parent)), page)
+        tables = []
+        for name, rows in by_table(self.rows).items():
+            # Tables of single images are only in the JSON document.
+            if not name.startswith("images"):
+                heading = HEADINGS.get(name, name)
+                title = f"{heading[0].upper()}{heading[1:]}"
+                captions = (text for start, text in CAPTIONS.items() if name.startswith(start))
+                tables.append(Section(title, rows, next(captions)))
+        strips = pictures(self.pairs, self.methods, page.parent)
+        notes = (*NOTES, *self.notes)
+        write_report(Report(self.title, headline(self.rows), tables, strips, notes), page)
         return page
 
 
@@ -295,27 +305,6 @@ def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -
         )
         strips.append(Picture(pair.site, picture_url(strip), caption))
     return strips
-
-
-def evaluation_report(evaluation: Evaluation, strips: Sequence[Picture]) -> Report:
-    """Arrange the results of an evaluation as a page: headline, tables, pictures and notes.
-
-    Tables of single images are left out; they are only in the JSON document.
-
-    Args:
-        evaluation: the results.
-        strips: the pictures of the page, as `pictures` draws them.
-    """
-    tables = []
-    for name, rows in by_table(evaluation.rows).items():
-        if not name.startswith("images"):
-            heading = HEADINGS.get(name, name)
-            title = f"{heading[0].upper()}{heading[1:]}"
-            captions = (text for start, text in CAPTIONS.items() if name.startswith(start))
-            tables.append(Section(title, rows, next(captions)))
-    return Report(
-        evaluation.title, headline(evaluation.rows), tables, strips, (*NOTES, *evaluation.notes)
-    )
 
 
 MEAN_CAPTION = (

@@ -29,7 +29,6 @@ from beers_deploy.studies.evaluation.target_scenes import (
     POINT_STEP_PX,
     Edges,
     Pattern,
-    Points,
     Targets,
     point_places,
     point_radiance,
@@ -77,12 +76,23 @@ def target_row(method: Method, targets: Targets) -> Row:
         targets: the acquired targets.
 
     Returns:
-        The row of the method in the table of targets: the flux of points in %, and the contrast of
-        patterns relative to the reference.
+        The row of the method in the table of targets: the flux of points in % (the light of a point
+        over its light in the image that the reference sensor acquires without noise), and the
+        contrast of patterns relative to the reference.
     """
     figures: dict[str, Figure] = {}
     for points in targets.points:
-        figures |= flux_figures(method, points)
+        # The difference from the same background without points, with the same noise, is much more
+        # accurate than one with a ring around the point would be.
+        light = method.restore(points.acquired).astype(np.float64) - method.restore(points.flat)
+        values: dict[float, list[float]] = {radiance: [] for radiance in POINT_RADIANCES}
+        for row, column in point_places():
+            place = _aperture(row), _aperture(column)
+            flux = 100 * float(light[place].sum() / points.expected[place].sum(dtype=np.float64))
+            values[point_radiance(row, column)].append(flux)
+        for radiance, fluxes in values.items():
+            source = f"mean of {len(fluxes)} points in {APERTURE_PX} x {APERTURE_PX} px"
+            figures[flux_name(radiance, points.background)] = _mean(fluxes, "%", source)
     for name in dict.fromkeys(pattern.name for pattern in targets.patterns):
         alike = [pattern for pattern in targets.patterns if pattern.name == name]
         figures[name] = transfer_figure(method, alike)
@@ -174,33 +184,6 @@ def flux_name(radiance: float, background: float) -> str:
         background: the radiance of the background, in W/m2/sr/um.
     """
     return f"flux of points of {radiance:g} on {background:g} W/m2/sr/um"
-
-
-def flux_figures(method: Method, points: Points) -> dict[str, Figure]:
-    """Restore points of light by a method, and measure the flux: the light of a point in the result
-    over its light in the image that the reference sensor acquires without noise.
-
-    The result for the same background without points, with the same noise, is subtracted first. The
-    difference is much more accurate than one with a ring around the point would be.
-
-    Args:
-        method: the method.
-        points: the acquired image of points on one background.
-
-    Returns:
-        The mean flux in % for each light of a point, by name, with its 90 % interval.
-    """
-    light = method.restore(points.acquired).astype(np.float64) - method.restore(points.flat)
-    values: dict[float, list[float]] = {radiance: [] for radiance in POINT_RADIANCES}
-    for row, column in point_places():
-        place = _aperture(row), _aperture(column)
-        flux = 100 * float(light[place].sum() / points.expected[place].sum(dtype=np.float64))
-        values[point_radiance(row, column)].append(flux)
-    figures = {}
-    for radiance, fluxes in values.items():
-        source = f"mean of {len(fluxes)} points in {APERTURE_PX} x {APERTURE_PX} px"
-        figures[flux_name(radiance, points.background)] = _mean(fluxes, "%", source)
-    return figures
 
 
 def _aperture(number: int) -> slice:
