@@ -22,8 +22,7 @@ from beers_deploy.profiles.errors import OptionError, encodable, one_line, print
 from beers_deploy.profiles.figures import Check, Row, by_table
 from beers_deploy.tables.columns import LEGEND
 from beers_deploy.tables.frames import bars, tidy_frame, wide_frame
-from beers_deploy.tables.html import html_table, html_text
-from beers_deploy.tables.markdown import markdown_table, markdown_text
+from beers_deploy.tables.markup import html_table, html_text, markdown_table, markdown_text
 from beers_deploy.tables.terminal import PIPE_WIDTH, default_console, plain, print_rows
 
 if TYPE_CHECKING:

@@ -9,8 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from beers_deploy.dpu.graph import Operation, SizedGraph
-from beers_deploy.dpu.shapes import Kind, Shape
+from beers_deploy.dpu.graph import Kind, Operation, Shape, SizedGraph
 from beers_deploy.quant.onnx.window import Window
 
 Size = int | tuple[int, int]

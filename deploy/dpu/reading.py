@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 
-from beers_deploy.dpu.graph import Operation, SizedGraph
-from beers_deploy.dpu.shapes import Kind, Shape, kind_of, out_shape
+from beers_deploy.dpu.graph import Kind, Operation, Shape, SizedGraph, kind_of, out_shape
 from beers_deploy.model.bank import GAINS, LARGEST, WIDE
 from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.profiles.shipped import TILE_PX

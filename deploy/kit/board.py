@@ -26,7 +26,7 @@ from beers_deploy.profiles.shipped import BLIND, TILE_PX
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.encodings import save_config
 from beers_deploy.quant.session import open_session, tensors_of
-from beers_deploy.tables.markdown import markdown_text
+from beers_deploy.tables.markup import markdown_text
 
 logger = logging.getLogger(__name__)
 

@@ -2,6 +2,6 @@
 
 - `page` renders figures, tables and pictures; `plots` draws with matplotlib;
 - `sensitivity_page` composes the page of `quantize --report`;
-- `view` shows a restored image and its raw one, from the pictures of `view_layers`; OpenSeadragon
-  draws them. `openseadragon/` contains it unchanged, with its licence.
+- `view` shows a restored image and its raw one; OpenSeadragon draws them. `openseadragon/` contains
+  it unchanged, with its licence.
 """

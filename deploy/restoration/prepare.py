@@ -36,8 +36,11 @@ from beers_deploy.restoration.runtime import (
     open_runtime,
     tiles_at_once,
 )
-from beers_deploy.restoration.sensor_check.check import SensorCheck, checked_sensor
-from beers_deploy.restoration.sensor_check.raw import restored_already
+from beers_deploy.restoration.sensor_check.check import (
+    SensorCheck,
+    checked_sensor,
+    restored_already,
+)
 from beers_deploy.restoration.steps import Around, consistency_steps, exposed_networks, exposures_of
 from beers_deploy.restoration.tiles.engine import Restorer
 from beers_deploy.restoration.tiles.rows import RestoredRow, restore_rows, rows_to_run

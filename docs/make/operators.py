@@ -22,7 +22,7 @@ from beers_deploy.dpu.checker.operators import (
     rule_text,
 )
 from beers_deploy.dpu.checker.remarks import REMARKS
-from beers_deploy.dpu.shapes import KINDS, Kind
+from beers_deploy.dpu.graph import KINDS, Kind
 from beers_deploy.profiles.shipped import board_names, npu_names
 from beers_deploy.profiles.target import TargetProfile
 

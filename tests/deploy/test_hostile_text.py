@@ -33,7 +33,7 @@ from beers_deploy.profiles.figures import Check, Row, measured, unavailable
 from beers_deploy.report.page import Picture, Report, Section, render
 from beers_deploy.report.plots import look, new_figure, svg_of
 from beers_deploy.results import Input, Table
-from beers_deploy.tables.markdown import markdown_table, markdown_text
+from beers_deploy.tables.markup import markdown_table, markdown_text
 from beers_deploy.tables.terminal import PIPE_WIDTH, print_rows
 
 HOSTILE = (

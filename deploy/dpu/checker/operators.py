@@ -18,8 +18,7 @@ from itertools import chain
 from beers_deploy.dpu.board import SIZED, Dpu
 from beers_deploy.dpu.checker import conv_rules, number_rules, other_rules
 from beers_deploy.dpu.checker.finding import Finding, Rule
-from beers_deploy.dpu.graph import Operation
-from beers_deploy.dpu.shapes import Kind
+from beers_deploy.dpu.graph import Kind, Operation
 from beers_deploy.profiles.validation import check_keys
 from beers_deploy.quant.onnx.window import Window
 

@@ -7,7 +7,7 @@ import math
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.conv_rules import alu_padding
 from beers_deploy.dpu.checker.finding import Finding, beyond_range, shown
-from beers_deploy.dpu.graph import CONVOLUTIONS, Operation
+from beers_deploy.dpu.graph import CONVOLUTIONS, WINDOWED, Operation
 from beers_deploy.profiles.errors import sizes
 from beers_deploy.quant.domains import SEPARATOR, foreign_remedy, is_foreign
 
@@ -300,9 +300,6 @@ def resize_channels(op: Operation, dpu: Dpu) -> Finding | None:
     return _too_many(
         op.channels[0], dpu.channels_max, "reduce them with a 1 x 1 convolution before"
     )
-
-
-WINDOWED = {"conv", "grouped conv", "depthwise", "transposed", "pool"}
 
 
 def map_exists(op: Operation, dpu: Dpu) -> Finding | None:

@@ -8,8 +8,7 @@ from itertools import chain
 
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.finding import groups_of
-from beers_deploy.dpu.graph import Operation
-from beers_deploy.dpu.shapes import Shape
+from beers_deploy.dpu.graph import Operation, Shape
 
 FUSED = ("activation", "quantize", "dequantize", "pixel shuffle")
 """Kinds that cost nothing: done on the way out of the operation before; a pixel shuffle is where

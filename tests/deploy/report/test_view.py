@@ -17,9 +17,16 @@ from PIL import Image
 from beers_deploy.model.raster.reader import open_raster
 from beers_deploy.model.self_check import BLOCK_PX, OUTSIDE, SMOOTH, WITHIN
 from beers_deploy.profiles.errors import MachineError, OptionError
-from beers_deploy.report import view_layers
-from beers_deploy.report.view import TILE_PX, pyramid, write_view
-from beers_deploy.report.view_layers import SELF_CHECK, STATES, Layer, layers_of
+from beers_deploy.report import view
+from beers_deploy.report.view import (
+    SELF_CHECK,
+    STATES,
+    TILE_PX,
+    Layer,
+    layers_of,
+    pyramid,
+    write_view,
+)
 from beers_deploy.verbs.restore import restore
 from tests.deploy.browser import run_script
 
@@ -73,15 +80,15 @@ def test_a_large_image_is_reduced_to_means_of_known_pixels(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The factor is the smallest that fits, the last block may be smaller, and the page says so."""
-    monkeypatch.setattr(view_layers, "SIDE_PX", 32)
+    monkeypatch.setattr(view, "SIDE_PX", 32)
     raw = noise(70, 97)
     raw[:4, :3] = 0
     raw[4:8, :4] = 0
     raw[3, 3] = 1234
     image = write(tmp_path / "raw.tif", raw, nodata=0)
     with open_raster(image) as source:
-        factor = view_layers.reduction(source.raster)
-        (plane,) = view_layers.read_planes(source, [0], factor)
+        factor = view.reduction(source.raster)
+        (plane,) = view.read_planes(source, [0], factor)
     assert factor == 4
     assert plane.shape == (18, 25)
     assert plane[3, 5] == pytest.approx(raw[12:16, 20:24].mean())

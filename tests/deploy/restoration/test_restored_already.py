@@ -19,7 +19,7 @@ from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.network import Network
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.restoration.sensor_check.raw import restored_already
+from beers_deploy.restoration.sensor_check.check import restored_already
 from tests.deploy.command_line import done
 from tests.deploy.restoration.runs import source_of
 
