@@ -114,7 +114,7 @@ def layers_of(
             others.append(_map_layer(name, source, facts))
         notes = _notes(facts, result.raster, len(bands))
         made_px = _pixel_px(result.raster, facts)
-    stretches = [_stretch_of(plane) for plane in before]
+    stretches = [Stretch(*np.percentile(_sample(plane), STRETCH).tolist()) for plane in before]
     legend = _ends(stretches, _unit(facts))
     layers = [
         Layer("raw image", _stretched(before, stretches), reduction(facts), legend),
@@ -168,11 +168,6 @@ def _sample(plane: Planes) -> Planes:
     sample = plane[::step, ::step]
     values = sample[np.isfinite(sample)]
     return values if values.size else np.zeros(1, np.float32)
-
-
-def _stretch_of(plane: Planes) -> Stretch:
-    black, white = np.percentile(_sample(plane), STRETCH)
-    return Stretch(float(black), float(white))
 
 
 def _stretched(planes: Planes, stretches: Sequence[Stretch]) -> Pixels:

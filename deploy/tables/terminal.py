@@ -61,7 +61,15 @@ def print_rows(title: str, rows: Iterable[Row], console: Console) -> None:
     for by_figure, stacked in product((down, not down), (False, True)):
         build = _by_figure if by_figure else _by_row
         layout = build(table_rows, stacked)
-        if _fits(layout, console):
+        # On its own console, the least width of a table never exceeds the console's.
+        wide = console.options.update(width=10 * PIPE_WIDTH)
+        needed = Measurement.get(console, wide, layout)
+        if needed.maximum > console.width:
+            # Names are shortened before figures: rich narrows the widest columns, whatever their
+            # least width, unless it is fixed.
+            for column in layout.columns:
+                column.width = column.min_width if column.justify == "right" else None
+        if needed.minimum <= console.width:
             console.print(layout)
             break
     else:
@@ -69,18 +77,6 @@ def print_rows(title: str, rows: Iterable[Row], console: Console) -> None:
     for reason in missing(table_rows):
         console.print(plain(f"- {reason}"), style="dim", highlight=False, soft_wrap=True)
     console.print()
-
-
-def _fits(table: Table, console: Console) -> bool:
-    """Return True if a table fits with each figure whole. Names are shortened before figures."""
-    # On its own console, the least width of a table never exceeds the console's.
-    wide = console.options.update(width=10 * PIPE_WIDTH)
-    needed = Measurement.get(console, wide, table)
-    if needed.maximum > console.width:
-        # rich narrows the widest columns, whatever their least width, unless it is fixed.
-        for column in table.columns:
-            column.width = column.min_width if column.justify == "right" else None
-    return needed.minimum <= console.width
 
 
 def _empty() -> Table:

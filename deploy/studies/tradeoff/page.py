@@ -284,7 +284,9 @@ def series(study: Tradeoff) -> Iterator[Series]:
     names: dict[str, int] = {}
     groups: dict[tuple[str, str], list[Measured]] = {}
     for point in placed(study.points, study.cost):
-        name = _kind(point)
+        name = point.text["method"]
+        if point.point is None or point.point.variant.network is None:
+            name = LIBRARIES if name in BASELINES else PIPELINES
         names.setdefault(name, len(names))
         groups.setdefault((name, point.text["board"]), []).append(point)
     # By the order of names, so that a board has one marker however the boards were listed.
@@ -293,12 +295,6 @@ def series(study: Tradeoff) -> Iterator[Series]:
         colour = LIGHT[SERIES[names[name] % len(SERIES)]]
         number = names[name] if len(study.boards) == 1 else places.index(board)
         yield Series(name, board, colour, MARKERS[number % len(MARKERS)], members)
-
-
-def _kind(point: Measured) -> str:
-    if point.point is not None and point.point.variant.network is not None:
-        return point.text["method"]
-    return LIBRARIES if point.text["method"] in BASELINES else PIPELINES
 
 
 def _places(points: Sequence[Measured], cost: str) -> tuple[list[float], list[float]]:
