@@ -224,7 +224,7 @@ class Curve:
         name: the name in the legend.
         colour: the position of the colour in SERIES.
         dashed: True for a dashed line.
-        points: the points (x, y) in order, with x above 0 on a logarithmic axis.
+        points: the points (x, y) in order, with x above 0.
     """
 
     name: str
@@ -251,17 +251,13 @@ def curves_svg(
     panels: Sequence[tuple[str, Sequence[Curve]]],
     x_title: str,
     y_title: str,
-    *,
-    logarithmic: bool = True,
 ) -> str:
-    """Draw panels side by side that share the y axis. Each has an x axis of its own.
+    """Draw panels side by side that share the y axis. Each has a logarithmic x axis of its own.
 
     Args:
         panels: the title and the curves of each panel.
         x_title: the title of the x axis.
         y_title: the title of the y axis.
-        logarithmic: if True, the x axis is logarithmic and each point has a dot; else only lines
-            are drawn.
 
     Returns:
         An SVG file that follows the reader's light or dark mode.
@@ -281,13 +277,12 @@ def curves_svg(
         all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False, gridspec_kw=frame)[0]
         handles = {}
         for axes, (title, curves) in zip(all_axes, panels, strict=True):
-            axes.set(xscale="log" if logarithmic else "linear", title=title)
+            axes.set(xscale="log", title=title)
             axes.margins(0.06)
             for curve in curves:
                 style = {"color": LIGHT[SERIES[curve.colour]], "ls": "--" if curve.dashed else "-"}
-                style["marker"] = "o" if logarithmic else ""
                 xs_and_ys = zip(*curve.points, strict=True)
-                lines = axes.plot(*xs_and_ys, **style, ms=5, lw=2, gid="curve")
+                lines = axes.plot(*xs_and_ys, **style, marker="o", ms=5, lw=2, gid="curve")
                 handles[curve.name] = lines[0]
             set_ticks(axes.xaxis, 5)
         set_ticks(all_axes[0].yaxis, 8)

@@ -205,7 +205,7 @@ def preview(study: Study) -> Table:
     benchmark, _ = benchmark_of(study)
     # A float network stands for its INT8 one, because quantising would take too long here.
     points = points_for(study, require_quantizable)
-    methods = _methods([point.variant for point in points], benchmark)
+    methods = _methods(points, benchmark)
     crop, reference = (
         image[:PREVIEW_PX, :PREVIEW_PX]
         for image in (benchmark.pairs[0].degraded, benchmark.pairs[0].reference)
@@ -287,7 +287,7 @@ def _measured(
     swath: Swath,
 ) -> list[Measured]:
     """Measure quality and time here of every point, and predict its figures on the board."""
-    methods = _methods([point.variant for point in points], benchmark)
+    methods = _methods(points, benchmark)
     results = list[Measured]()
     # Points of several boards may cut the images alike.
     scores_of: dict[tuple[Variant, int | None, tuple[int, ...]], list[Scores]] = {}
@@ -319,14 +319,14 @@ def _measured(
     return results
 
 
-def _methods(variants: Sequence[Variant], benchmark: Benchmark) -> dict[Variant, Method]:
+def _methods(points: Sequence[Point], benchmark: Benchmark) -> dict[Variant, Method]:
     """Return the method of each variant: a network with its exposures, or a traditional one."""
     sensors = benchmark.degraded, benchmark.reference
     return {
         variant: method_of(variant.name, variant.network, *sensors)
         if variant.network
         else method_named(variant.method, *sensors)
-        for variant in dict.fromkeys(variants)
+        for variant in dict.fromkeys(point.variant for point in points)
     }
 
 
