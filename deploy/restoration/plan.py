@@ -110,11 +110,12 @@ def plan_side(
         min_side_px: the shortest side that the network accepts. A shorter image is extended to it.
 
     Raises:
-        OptionError: the halo is negative, or a tile is too small to retain `alignment_px` pixels
-            between two halos.
+        OptionError: the halo is negative, or a tile is too small for the network, or to retain
+            `alignment_px` pixels between two halos.
     """
-    if tile_px < 2 * halo_px + alignment_px or halo_px < 0:
-        least = f", at least {2 * halo_px + alignment_px} px" if alignment_px > 1 else ""
+    smallest_px = max(2 * halo_px + alignment_px, _up(min_side_px, alignment_px))
+    if tile_px < smallest_px or halo_px < 0:
+        least = f", at least {smallest_px} px" if smallest_px > 2 * halo_px + 1 else ""
         raise OptionError(
             f"`tile` must be more than twice the halo of {halo_px} px{least}, got {tile_px} px. "
             "Use larger tiles or a smaller halo."
@@ -139,7 +140,9 @@ def _up(size_px: int, alignment_px: int) -> int:
     return -(-size_px // alignment_px) * alignment_px
 
 
-def even_side_px(size_px: int, tile_px: int, halo_px: int, alignment_px: int = 1) -> int:
+def even_side_px(
+    size_px: int, tile_px: int, halo_px: int, alignment_px: int = 1, min_side_px: int = 1
+) -> int:
     """Return the shortest side of a tile, in pixels, with which there are as many tiles as with
     `tile_px`.
 
@@ -148,14 +151,15 @@ def even_side_px(size_px: int, tile_px: int, halo_px: int, alignment_px: int = 1
         tile_px: the longest side that a tile may have.
         halo_px: the context around the retained part of a tile.
         alignment_px: the multiple at which tiles begin and end; 1 without strides.
+        min_side_px: the shortest side that the network accepts.
 
     Raises:
-        OptionError: tiles of `tile_px` are too small for the halo.
+        OptionError: tiles of `tile_px` are too small for the halo or for the network.
     """
     # A last tile that is moved inward computes pixels twice; even tiles compute fewer.
-    count = len(plan_side(size_px, tile_px, halo_px, alignment_px))
+    count = len(plan_side(size_px, tile_px, halo_px, alignment_px, min_side_px))
     even_px = -(-(_up(size_px, alignment_px) + 2 * halo_px * (count - 1)) // count)
-    return max(_up(even_px, alignment_px), 2 * halo_px + alignment_px)
+    return max(_up(max(even_px, min_side_px), alignment_px), 2 * halo_px + alignment_px)
 
 
 @dataclass(frozen=True)
@@ -351,7 +355,7 @@ def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, tiling: Tiling
     def side(size_px: int) -> tuple[Span, ...]:
         alignment_px = tiling.alignment_px
         longest_px = (
-            even_side_px(size_px, tile_px, halo_px, alignment_px)
+            even_side_px(size_px, tile_px, halo_px, alignment_px, tiling.min_side_px)
             if tiling.fixed_px is None
             else tile_px
         )

@@ -52,3 +52,12 @@ def test_a_span_reads_as_many_pixels_as_a_network_needs() -> None:
 def test_a_tile_without_room_between_its_halos_is_refused() -> None:
     with pytest.raises(OptionError, match="halo of 20"):
         plan_side(100, 40, 20)
+    with pytest.raises(OptionError, match="at least 34 px, got 20 px"):
+        plan_side(100, 20, 4, 2, min_side_px=33)
+
+
+def test_tiles_are_no_shorter_than_the_border_that_a_network_mirrors() -> None:
+    """One tile of a small image may be short, and so may the even tiles of a larger one."""
+    plan = make_plan((1, 9, 40), 30, 5, Tiling(5, min_side_px=17))
+    sides = {span.stop - span.start for span in (*plan.rows, *plan.columns)}
+    assert min(sides) >= 17
