@@ -364,16 +364,14 @@ Table = Mapping[str, Constant]
 """The parameters of an effect as a file states them, each a number or a range."""
 
 
-def _table_type(effect: type[Effect]) -> Any:
-    """Return the type of an effect's table: every parameter and no other, within its limits."""
-    parameters: Any = {
-        key: (Annotated[Constant, limits], ...) for key, limits in effect.limits().items()
+_OPTIONAL: dict[str, Any] = {}
+for _name, _effect in TABLES.items():
+    # The type of an effect's table: every parameter and no other, within its limits.
+    _parameters: Any = {
+        key: (Annotated[Constant, limits], ...) for key, limits in _effect.limits().items()
     }
-    model = create_model(effect.__name__, __config__=CONFIG, **parameters)
-    return Annotated[model, AfterValidator(dict)]
-
-
-_OPTIONAL: Any = {name: (_table_type(effect), None) for name, effect in TABLES.items()}
+    _model = create_model(_effect.__name__, __config__=CONFIG, **_parameters)
+    _OPTIONAL[_name] = (Annotated[_model, AfterValidator(dict)], None)
 AnyEffects = create_model("Effects", __config__=CONFIG, **_OPTIONAL)
 
 

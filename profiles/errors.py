@@ -183,22 +183,17 @@ def missing_extra(error: ImportError, where: str) -> Exception:
         A `MissingExtraError` that names the extra to install, if an optional package is missing or
         does not load; otherwise `error` itself.
     """
-    package = _imported(error)
-    return error if package is None else _without(package, where, error)
-
-
-def _imported(error: ImportError) -> str | None:
-    """Return the optional package whose import failed, by the module's name or by the code that
-    imported it.
-    """
-    # Python runs the top level of a module under this name. A fault within a function is no failed
-    # import.
+    # The package whose import failed, by the module's name or by the code that imported it. Python
+    # runs the top level of a module under this name: a fault within a function is no failed import.
     at_import = (
         frame for frame, _ in walk_tb(error.__traceback__) if frame.f_code.co_name == "<module>"
     )
     names = (error.name, *(frame.f_globals.get("__name__") for frame in at_import))
-    packages = (str(name).partition(".")[0] for name in names)
-    return next((package for package in packages if package in EXTRAS), None)
+    for name in names:
+        package = str(name).partition(".")[0]
+        if package in EXTRAS:
+            return _without(package, where, error)
+    return error
 
 
 def _without(package: str, where: str, error: ImportError) -> MissingExtraError:

@@ -52,7 +52,12 @@ class PointSpreadFile:
             ProfileError: the path leads out of the folder, the file holds no array of real numbers,
                 or the samples are not those of a blur around the middle.
         """
-        if not _lies_within(folder, self.psf):
+        try:
+            inside = (folder / self.psf).resolve().is_relative_to(folder.resolve())
+        # A circle of links raises the first, a NUL the second.
+        except (OSError, ValueError):
+            inside = False
+        if not inside:
             raise ProfileError(
                 f"{label} mtf.psf must be the name of a file in the profile's folder or below it, "
                 f"got {printable(repr(self.psf))}. Copy the file there."
@@ -66,7 +71,15 @@ class PointSpreadFile:
                 f"middle, but it lies {shift_px:.3g} pixels off. Crop the file around its "
                 "centroid, and subtract its background."
             )
-        core = _trimmed(samples)
+        # Border rows and columns that hold, in total, less than CUT_SHARE of the weight.
+        weight = np.abs(samples)
+        parts = []
+        for axis in (1, 0):
+            grown = np.cumsum(weight.sum(axis)) / weight.sum()
+            # Two axes with two ends each: every end may lose a quarter of the share.
+            ends = np.searchsorted(grown, (CUT_SHARE / 4, 1 - CUT_SHARE / 4)) + np.array([0, 1])
+            parts.append(slice(*ends))
+        core = samples[tuple(parts)]
         height, width = core.shape
         if max(height, width) > KEPT_SIDE:
             raise ProfileError(
@@ -74,17 +87,13 @@ class PointSpreadFile:
                 f"{KEPT_SIDE} samples, but it takes {width} x {height}. Crop it, or sample it "
                 "more coarsely."
             )
-        fields = {"height": height, "width": width, "samples": packed(core)}
-        fields |= {"samples_per_px": self.psf_samples_per_px}
+        fields = {
+            "height": height,
+            "width": width,
+            "samples": packed(core),
+            "samples_per_px": self.psf_samples_per_px,
+        }
         return validated(PointSpread, fields, where)
-
-
-def _lies_within(folder: Path, name: str) -> bool:
-    try:
-        return (folder / name).resolve().is_relative_to(folder.resolve())
-    # A circle of links raises the first, a NUL the second.
-    except (OSError, ValueError):
-        return False
 
 
 def _normalised(where: str, samples: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -100,18 +109,6 @@ def _normalised(where: str, samples: NDArray[np.float64]) -> NDArray[np.float64]
             "file; a background must be subtracted first."
         )
     return samples / total
-
-
-def _trimmed(samples: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Remove border rows and columns that hold, in total, less than CUT_SHARE of the weight."""
-    weight = np.abs(samples)
-    parts = []
-    for axis in (1, 0):
-        grown = np.cumsum(weight.sum(axis)) / weight.sum()
-        # Two axes with two ends each: every end may lose a quarter of the share.
-        ends = np.searchsorted(grown, (CUT_SHARE / 4, 1 - CUT_SHARE / 4)) + np.array([0, 1])
-        parts.append(slice(*ends))
-    return samples[tuple(parts)]
 
 
 def _read_samples(where: str, path: Path) -> NDArray[np.float64]:

@@ -106,8 +106,20 @@ def sensor_fields(label: str, raw: Mapping[str, Any], folder: Path) -> dict[str,
         fields |= _content(f"{label} {table}", table, raw[table])
     if "mtf_nyquist" in fields:
         return fields
-    keys = [key for key in RESPONSE if key in fields]
-    return fields | _blur(label, {key: fields.pop(key) for key in keys}, folder)
+    # [mtf] states a response, from which the contrasts at Nyquist follow.
+    blur = {key: fields.pop(key) for key in RESPONSE if key in fields}
+    groups = {key: f"mtf.{key}" for key in RESPONSE}
+    parts = validated(dict[str, Stated], blur, label, groups)
+    values = {key: part.value for key, part in parts.items()}
+    if "psf" in parts:
+        about = parts["psf"]
+        response: Response = validated(PointSpreadFile, values, label, groups).read(label, folder)
+    else:
+        # Both contrasts have one status, which an axis that was not measured decides.
+        axes = [parts["across"], parts.get("along", parts["across"])]
+        about = next((axis for axis in axes if axis.status == "assumed"), axes[0])
+        response = validated(MtfTable, {"along": values["across"], **values}, label, groups)
+    return {**fields, "response": response, **axes_of(response, about.status, about.source)}
 
 
 def _content(where: str, table: str, raw: object) -> Mapping[str, Any]:
@@ -129,22 +141,6 @@ def _content(where: str, table: str, raw: object) -> Mapping[str, Any]:
         )
     check_keys(where, raw, *(begun or ways)[0])
     return raw
-
-
-def _blur(label: str, raw: Mapping[str, object], folder: Path) -> dict[str, Any]:
-    """Return the response that [mtf] states, and its contrasts at Nyquist as constants."""
-    groups = {key: f"mtf.{key}" for key in RESPONSE}
-    parts = validated(dict[str, Stated], raw, label, groups)
-    values = {key: part.value for key, part in parts.items()}
-    if "psf" in parts:
-        about = parts["psf"]
-        response: Response = validated(PointSpreadFile, values, label, groups).read(label, folder)
-    else:
-        # Both contrasts have one status, which an axis that was not measured decides.
-        axes = [parts["across"], parts.get("along", parts["across"])]
-        about = next((axis for axis in axes if axis.status == "assumed"), axes[0])
-        response = validated(MtfTable, {"along": values["across"], **values}, label, groups)
-    return {"response": response, **axes_of(response, about.status, about.source)}
 
 
 def axes_of(response: Response, status: Status, source: str) -> dict[str, Constant | None]:

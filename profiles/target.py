@@ -180,13 +180,8 @@ def _read(name: str) -> TargetProfile:
     if profile.configurations:
         # This raises if the default is none of them.
         profile.configuration()
-    # Last, because a wrong type or number is the more precise message.
-    _check_names(label, profile)
-    return profile
-
-
-def _check_names(label: str, profile: TargetProfile) -> None:
-    """Raise ProfileError if a table or a key is in no shipped target, because nothing reads it."""
+    # Nothing reads a table or a key that is in no shipped target. That is checked last, because a
+    # wrong type or number is the more precise message.
     keys = _shipped_keys()
     # The rules of any device hold where a board states their constants, but what only an NPU or a
     # host reads would have no effect on a DPU.
@@ -197,6 +192,7 @@ def _check_names(label: str, profile: TargetProfile) -> None:
             check_keys(f"{label} [{name}]", table, (), keys[name])
     for name, table in profile.configurations.items():
         check_keys(f"{label} [configurations.{name}]", table, (), keys["configurations"])
+    return profile
 
 
 @cache

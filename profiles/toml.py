@@ -36,25 +36,18 @@ def read_toml_text(path: Path) -> dict[str, object]:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ValueError(_line_at_fault(text, str(error))) from None
+        # tomllib's message ends in "(at line 3, column 9)" or "(at end ...)".
+        reason, _, where = str(error).rpartition(" (at ")
+        lines = text.rstrip().split("\n")
+        place = re.match(r"line (\d+)", where)
+        number = int(place[1]) if place else len(lines)
+        line = lines[number - 1].strip() if number <= len(lines) else ""
+        raise ValueError(f"line {number}, {line[:QUOTED]!r}: {reason}") from None
     except RecursionError:
         raise ValueError(TOO_DEEP) from None
     # Python converts no more than 4300 digits, and its message names a setting of its own.
     except ValueError:
         raise ValueError("a number has too many digits") from None
-
-
-def _line_at_fault(text: str, reason: str) -> str:
-    """Return the number of the line with the error, the line itself, and tomllib's reason.
-
-    tomllib's message ends in "(at line 3, column 9)" or "(at end ...)".
-    """
-    what, _, where = reason.rpartition(" (at ")
-    lines = text.rstrip().split("\n")
-    place = re.match(r"line (\d+)", where)
-    number = int(place[1]) if place else len(lines)
-    line = lines[number - 1].strip() if number <= len(lines) else ""
-    return f"line {number}, {line[:QUOTED]!r}: {what}"
 
 
 def read_json(path: Path) -> object:
