@@ -20,7 +20,7 @@ def grow(network: N, variant: Variant, generator: torch.Generator) -> N:
     A network of the same size is copied. Features are duplicated, and their weights are divided
     among the copies (Net2Net, Chen et al. 2016). Added blocks are distributed evenly between the
     others. Their second convolution is zero, so that each initially passes on its input. At a
-    larger scale each feature becomes one for each pixel of a place (see `_coarser`).
+    larger scale each feature becomes one for each pixel of a place.
 
     Args:
         network: the smaller network.
@@ -33,20 +33,27 @@ def grow(network: N, variant: Variant, generator: torch.Generator) -> N:
     weights = large.state_dict()
     small = network.state_dict()
     factor = variant.scale // network.variant.scale
+    places = factor**2
     for name, source in sources.items():
         weight = weights[f"{name}.weight"]
         bias = weights[f"{name}.bias"]
         if source is not None:
-            coarse = _coarser(small[f"{source}.weight"], factor)
+            # S x S places become channels: (O, I, 3, 3) is (O S^2, I S^2, 3, 3).
+            fine = small[f"{source}.weight"]
+            outputs, inputs = fine.shape[:2]
+            kernels = in_places(fine.flatten(0, 1).double().numpy(), factor)
+            by_feature = torch.from_numpy(kernels).to(fine)
+            by_feature = by_feature.view(outputs, inputs, places, places, 3, 3).transpose(1, 2)
+            coarse = by_feature.reshape(outputs * places, inputs * places, 3, 3)
             weight.copy_(_widened(coarse, weight.shape, generator))
-            bias.copy_(_repeated(small[f"{source}.bias"], bias.shape, factor))
+            bias.copy_(_repeated(small[f"{source}.bias"], bias.shape, places))
         elif name.endswith("second"):
             # An added block passes on its input until it has learnt something.
             weight.zero_()
     # The head's bias is linear in the sensor vector, so that its weights grow with the features.
     if isinstance(large, BankedConvBEERS):
         large.bias.weight.data.copy_(
-            _repeated(small["bias.weight"], large.bias.weight.shape, factor)
+            _repeated(small["bias.weight"], large.bias.weight.shape, places)
         )
     return large
 
@@ -76,19 +83,10 @@ def _sources(small: Variant, large: Variant) -> dict[str, str | None]:
     return sources
 
 
-def _repeated(rows: Tensor, shape: Sequence[int], factor: int) -> Tensor:
+def _repeated(rows: Tensor, shape: Sequence[int], places: int) -> Tensor:
     """Repeat rows of the features, (F, ...), to the number of features of the large network."""
-    coarse = rows.repeat_interleave(factor**2, 0)
+    coarse = rows.repeat_interleave(places, 0)
     return coarse.repeat(shape[0] // len(coarse), *[1] * (rows.ndim - 1))
-
-
-def _coarser(weight: Tensor, factor: int) -> Tensor:
-    """Rewrite a convolution (O, I, 3, 3) for S x S places in the channels: (O S^2, I S^2, 3, 3)."""
-    outputs, inputs = weight.shape[:2]
-    places = factor**2
-    coarse = torch.from_numpy(in_places(weight.flatten(0, 1).double().numpy(), factor)).to(weight)
-    by_feature = coarse.view(outputs, inputs, places, places, 3, 3).transpose(1, 2)
-    return by_feature.reshape(outputs * places, inputs * places, 3, 3)
 
 
 def _widened(weight: Tensor, channels: Sequence[int], generator: torch.Generator) -> Tensor:

@@ -49,10 +49,12 @@ class PatchRecipe:
 def turn(
     patches: np.ndarray, generator: np.random.Generator, quarters: bool = True, mirrors: bool = True
 ) -> np.ndarray:
-    """Apply one random symmetry of the square to patches (..., P, P), the same to all; see
-    `draw_turn`.
+    """Rotate patches (..., P, P) by random quarter turns, then mirror them or not, all in the same
+    way; see `draw_turn`.
     """
-    return turned(patches, *draw_turn(generator, quarters, mirrors))
+    quarter, mirrored = draw_turn(generator, quarters, mirrors)
+    rotated = np.rot90(patches, quarter, (-2, -1))
+    return rotated[..., ::-1] if mirrored else rotated
 
 
 def draw_turn(
@@ -74,12 +76,6 @@ def draw_turn(
     if not mirrors:
         return 0, False
     return quarter if quarters else quarter - quarter % 2, mirrored
-
-
-def turned(patches: np.ndarray, quarter: int, mirrored: bool) -> np.ndarray:
-    """Rotate patches (..., P, P) by quarter turns, then mirror them."""
-    rotated = np.rot90(patches, quarter, (-2, -1))
-    return rotated[..., ::-1] if mirrored else rotated
 
 
 Files = tuple[Path, Path]

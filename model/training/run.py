@@ -38,7 +38,7 @@ from beers_deploy.model.training.source import PatchSource
 from beers_deploy.model.training.stored import StoredPairs
 from beers_deploy.model.training.trainer import Batches, Precision, Schedule, Speed, Trainer, Worker
 from beers_deploy.model.training.validation import Validation, split_by_site, write_picture
-from beers_deploy.model.variants import Variant, variant_named
+from beers_deploy.model.variants import variant_named
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.sensor_numbers import numbers_of
 
@@ -98,7 +98,11 @@ def train(run: Run, resume: bool, worker: Worker) -> None:
         worker: the rank of this process among those that train together.
     """
     variant = variant_named(run.variant)
-    require_whole_places(run, variant)
+    if run.patches.patch_px % variant.scale:
+        raise OptionError(
+            f"`patch` must be a multiple of {variant.scale} px for a network at 1/{variant.scale} "
+            f"resolution, but it is {run.patches.patch_px} px."
+        )
     loss, message = loss_of(run)
     if message and worker.first:
         logger.info(message)
@@ -127,15 +131,6 @@ def train(run: Run, resume: bool, worker: Worker) -> None:
     if worker.first:
         recipe = about(run, names, validation.names, loss) | {"precision": run.precision}
         finish(trainer.averaged(), run.weights, recipe)
-
-
-def require_whole_places(run: Run, variant: Variant) -> None:
-    """Raise OptionError if the side of the patches is no multiple of the network's scale."""
-    if run.patches.patch_px % variant.scale:
-        raise OptionError(
-            f"`patch` must be a multiple of {variant.scale} px for a network at 1/{variant.scale} "
-            f"resolution, but it is {run.patches.patch_px} px."
-        )
 
 
 def _given(run: Run, path: Path) -> Network:

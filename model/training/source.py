@@ -6,7 +6,7 @@ sensor, scale, phase and look. Visiting whole scenes yields many patches for one
 
 import os
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import NamedTuple
@@ -133,26 +133,20 @@ class PatchSource:
             visits.append(scene_visit)
             count += len(scene_visit.patches)
             if count >= shard_size:
-                # Mixed, because neighbours of one scene would make a batch whose gradient knows one
-                # scene.
-                order = generator.permutation(count)[:shard_size]
-                return _mixed(visits, order)
-        raise ImageError(
-            "None of the training images is large enough for a patch of "
-            f"{self.recipe.patch_px} target pixels. Give larger images or a smaller patch."
-        )
-
-
-def _mixed(visits: Sequence[Visit], order: np.ndarray) -> Batch:
-    places = torch.from_numpy(order)
-    patches = torch.cat([item.patches for item in visits])[places.to(visits[0].patches.device)]
-    pair = patches[:, :1].contiguous(), patches[:, 1:].contiguous()
-    condition = [item.condition.parts for item in visits if item.condition is not None]
-    if not condition:
-        return Batch(*pair)
-    return Batch(
-        *pair, Condition(*(torch.cat(part)[places] for part in zip(*condition, strict=True)))
-    )
+                break
+        else:
+            raise ImageError(
+                "None of the training images is large enough for a patch of "
+                f"{self.recipe.patch_px} target pixels. Give larger images or a smaller patch."
+            )
+        # Mixed, because neighbours of one scene would make a batch whose gradient knows one scene.
+        places = torch.from_numpy(generator.permutation(count)[:shard_size])
+        patches = torch.cat([item.patches for item in visits])
+        patches = patches[places.to(patches.device)]
+        condition = None
+        if parts := [item.condition.parts for item in visits if item.condition is not None]:
+            condition = Condition(*(torch.cat(part)[places] for part in zip(*parts, strict=True)))
+        return Batch(patches[:, :1].contiguous(), patches[:, 1:].contiguous(), condition)
 
 
 def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -> Visit | None:
@@ -160,8 +154,18 @@ def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -
     ratio = int(generator.choice(recipe.oversamplings))
     if _room_px(scene, recipe, ratio) < recipe.patch_px:
         return None
-    images, sensor = _acquire_pair(scene, recipe, ratio, generator)
-    patches = cut(images, recipe.patch_px, generator)
+    look = recipe.looks.draw(generator)
+    phase_y, phase_x = (float(v) for v in generator.uniform(-ratio / 2, ratio / 2, 2))
+    sensor = (recipe.family or recipe.degraded).draw(generator)
+    target = recipe.reference.draw(generator)
+    passage = Pass(ratio, (phase_y, phase_x), look, recipe.margin_px)
+    signals = folded_signals(scene, (sensor, target), passage)
+    degraded = detected(signals[0], sensor, "degraded", generator)
+    if recipe.noisy_reference:
+        reference = detected(signals[1], target, "reference", generator)
+    else:
+        reference = noiseless(signals[1], target)
+    patches = cut(torch.stack([degraded, reference]), recipe.patch_px, generator)
     # A conditioned network is given the swapped axes of a sensor; a plain one cannot learn them.
     mirrors, quarters = sensor.symmetry
     quarter, mirrored = draw_turn(generator, quarters or recipe.family is not None, mirrors)
@@ -175,28 +179,6 @@ def _room_px(scene: Visited, recipe: PatchRecipe, ratio: int) -> int:
     return min(scene.sides) // ratio - 2 * recipe.margin_px
 
 
-def _acquire_pair(
-    scene: Visited, recipe: PatchRecipe, ratio: int, generator: np.random.Generator
-) -> tuple[Tensor, Instrument]:
-    """Simulate degraded and reference images, (2, H, W) over full scale.
-
-    Returns:
-        The images, and the sensor of the degraded one.
-    """
-    look = recipe.looks.draw(generator)
-    phase_y, phase_x = (float(v) for v in generator.uniform(-ratio / 2, ratio / 2, 2))
-    sensors = (recipe.family or recipe.degraded).draw(generator), recipe.reference.draw(generator)
-    signals = folded_signals(
-        scene, sensors, Pass(ratio, (phase_y, phase_x), look, recipe.margin_px)
-    )
-    degraded = detected(signals[0], sensors[0], "degraded", generator)
-    if recipe.noisy_reference:
-        reference = detected(signals[1], sensors[1], "reference", generator)
-    else:
-        reference = noiseless(signals[1], sensors[1])
-    return torch.stack([degraded, reference]), sensors[0]
-
-
 def _conditioned(patches: Tensor, sensor: Instrument, quarter: int, mirrored: bool) -> Visit:
     """Brighten dark patches (N, 2, P, P) as a restoration does, and add the description of their
     sensors.
@@ -206,28 +188,19 @@ def _conditioned(patches: Tensor, sensor: Instrument, quarter: int, mirrored: bo
     for factor in factors_for(sensor):
         factors[brightest * factor <= HEADROOM] = factor
     distinct, places = np.unique(factors, return_inverse=True)
-    conditions = [_condition_of(sensor, int(factor), quarter, mirrored) for factor in distinct]
-    condition = Condition.of(
-        torch.stack([vector for vector, _ in conditions]), [bank for _, bank in conditions]
-    )
+    vectors = []
+    banks = []
+    for factor in distinct.tolist():
+        brighter = replace(sensor, gain_dn_per_radiance=sensor.gain_dn_per_radiance * factor)
+        vector = vector_tensor(brighter)
+        # A quarter turn swaps the axes, whose MTFs are the first two values.
+        vectors.append(vector[[1, 0, 2, 3]] if quarter % 2 else vector)
+        bank = network_bank(brighter)
+        details = turned(torch.from_numpy(bank.details), quarter, mirrored)
+        banks.append(Bank(details.numpy(), bank.sigma))
+    condition = Condition.of(torch.stack(vectors), banks)
     scale = torch.from_numpy(factors).to(patches)[:, None, None, None]
     return Visit(patches * scale, condition.some(torch.from_numpy(places)))
-
-
-def _condition_of(
-    sensor: Instrument, factor: int, quarter: int, mirrored: bool
-) -> tuple[Tensor, Bank]:
-    """Return the vector (4,) and the bank of a sensor of `factor` times the gain, for turned
-    patches.
-    """
-    brighter = replace(sensor, gain_dn_per_radiance=sensor.gain_dn_per_radiance * factor)
-    vector = vector_tensor(brighter)
-    bank = network_bank(brighter)
-    if quarter % 2:
-        # A quarter turn swaps the axes, whose MTFs are the first two values.
-        vector = vector[[1, 0, 2, 3]]
-    details = turned(torch.from_numpy(bank.details), quarter, mirrored)
-    return vector, Bank(details.numpy(), bank.sigma)
 
 
 def cut(images: Tensor, patch_px: int, generator: np.random.Generator) -> Tensor:

@@ -114,18 +114,6 @@ class Step:
             (2 + T,) 1 for a step that changed nothing, the loss, and its terms in the order of
                 `names`.
         """
-        inputs = self._on_device(batch, rate, share)
-        if self.device.type != "cuda" or self.agree is not None:
-            return self._taken(inputs)
-        if self._graph is None:
-            self._record(inputs)
-        assert self._graph is not None and self._inputs is not None and self._outputs is not None  # noqa: S101, PT018
-        for memory, value in zip(self._inputs.tensors(), inputs.tensors(), strict=True):
-            memory.copy_(value)
-        self._graph.replay()
-        return self._outputs.clone()
-
-    def _on_device(self, batch: Batch, rate: float, share: float) -> Inputs:
         condition: Condition | None = None
         steps = list[Tensor]()
         if batch.condition is not None:
@@ -135,12 +123,20 @@ class Step:
                     step.to(self.device) for step in self.rounding.steps(batch.condition.gains)
                 ]
         degraded = batch.degraded.to(self.device, memory_format=torch.channels_last)
-        batch_on_device = Batch(degraded, batch.reference.to(self.device), condition)
-        return Inputs(
-            batch_on_device,
+        inputs = Inputs(
+            Batch(degraded, batch.reference.to(self.device), condition),
             steps,
             *(torch.tensor(value, device=self.device) for value in (rate, share)),
         )
+        if self.device.type != "cuda" or self.agree is not None:
+            return self._taken(inputs)
+        if self._graph is None:
+            self._record(inputs)
+        assert self._graph is not None and self._inputs is not None and self._outputs is not None  # noqa: S101, PT018
+        for memory, value in zip(self._inputs.tensors(), inputs.tensors(), strict=True):
+            memory.copy_(value)
+        self._graph.replay()
+        return self._outputs.clone()
 
     def _taken(self, inputs: Inputs) -> Tensor:
         total, terms = self._backward(inputs)

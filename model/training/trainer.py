@@ -186,7 +186,14 @@ class Trainer:
         self.worker = worker or Worker()
         self.loss = loss or RestorationLoss(recipe.loss)
         self.device = self.worker.device(device)
-        require_loss(self.loss)
+        weights = self.loss.weights
+        # A run whose loss is 0 for every network learns nothing.
+        if self.loss.perceptual is None and not weights.l1 + weights.fft + weights.psnr > 0:
+            lpips = ", except that of LPIPS, whose network was not found" if weights.lpips else ""
+            raise OptionError(
+                f"The loss is always 0, because the weights of all its terms are 0{lpips}. "
+                "Raise one of `l1_weight`, `fft_weight`, `psnr_weight`."
+            )
         self.step = 0
         self.guards = Guards()
         self.data = ""
@@ -312,8 +319,8 @@ class Trainer:
             "step": self.step,
             "guards": asdict(self.guards),
             "recipe": asdict(self.recipe),
+            "data": self.data,
         }
-        header["data"] = self.data
         header["sha256"] = checkpoint_sha256(tensors, header)
         write_tensors(path, arrays(tensors), header)
 
@@ -336,15 +343,3 @@ class Trainer:
             }
             step_count = tensors[f"moment.{name}.step"].to(self.device)
             self.optimiser.state[parameter] = {"step": step_count, **moments}
-
-
-def require_loss(loss: RestorationLoss) -> None:
-    """Raise OptionError if the loss is 0 for every network: such a run learns nothing."""
-    weights = loss.weights
-    if loss.perceptual is not None or weights.l1 + weights.fft + weights.psnr > 0:
-        return
-    left_out = ", except that of LPIPS, whose network was not found" if weights.lpips else ""
-    raise OptionError(
-        f"The loss is always 0, because the weights of all its terms are 0{left_out}. "
-        "Raise one of `l1_weight`, `fft_weight`, `psnr_weight`."
-    )
