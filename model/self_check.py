@@ -198,7 +198,16 @@ class SelfCheck:
             slice(placed.keep_start - placed.start, placed.keep_stop - placed.start)
             for placed in (down, across)
         )
-        counts = self._counts(raw, missing, down, across)[inside]
+        excluded = missing | (raw >= self.full_scale)
+        if excluded.any():
+            excluded = maximum_filter(excluded, 2 * NEAR_PX + 1, mode="constant")
+        # Only the image's own border is excluded, so that tiles give the same figures as the whole
+        # image.
+        counts = ~excluded[inside]
+        counts[: max(NEAR_PX - down.keep_start, 0)] = False
+        counts[max(down.size_px - NEAR_PX - down.keep_start, 0) :] = False
+        counts[:, : max(NEAR_PX - across.keep_start, 0)] = False
+        counts[:, max(across.size_px - NEAR_PX - across.keep_start, 0) :] = False
         y = np.where(counts, raw[inside], 0)
         dark, growth, square = self.variances
         # The variance is taken at the light of H x. The noise of y is in the residual as well, so
@@ -216,29 +225,6 @@ class SelfCheck:
         change = _sums(np.where(counts, (x[inside] - blurred) ** 2 / variance, 0), BLOCK_PX)
         enough = np.where(pixels < LEAST_PX, np.nan, pixels)
         return Judged(chi2=squares / enough, sharpening=change / enough)
-
-    def _counts(
-        self, raw: Image, missing: NDArray[np.bool_], down: Placed, across: Placed
-    ) -> NDArray[np.bool_]:
-        """Return which pixels count, (h, w).
-
-        Args:
-            raw: y, (h, w) pixel values.
-            missing: the pixels that are missing in y or x.
-            down: where the rows lie in the image.
-            across: where the columns lie in the image.
-        """
-        unknown = missing | (raw >= self.full_scale)
-        reached = unknown
-        if unknown.any():
-            reached = maximum_filter(unknown, 2 * NEAR_PX + 1, mode="constant")
-        inside = []
-        for placed, side in zip((down, across), raw.shape, strict=True):
-            # Only the image's own border is excluded, so that tiles give the same figures as the
-            # whole image.
-            places = np.arange(placed.start, placed.start + side)
-            inside.append((places >= NEAR_PX) & (places < placed.size_px - NEAR_PX))
-        return np.asarray(~reached & inside[0][:, None] & inside[1])
 
 
 def _filled(pixels: Image, missing: NDArray[np.bool_]) -> Image:

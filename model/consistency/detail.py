@@ -38,18 +38,6 @@ on photographs of training places); single pixels would add more noise than deta
 """
 
 
-def products_per_px(terms: int, near_px: int) -> float:
-    """Return the number of multiply-accumulate operations per pixel of the step for finer detail.
-
-    Args:
-        terms: the number of separable filters that make up the near part of the blur H.
-        near_px: the radius of these filters in pixels.
-    """
-    window_px = FINE_PX + 2 * near_px
-    near = terms * window_px * (1 / FINE_PX + 1 / FINE_PX**2)
-    return near + 2 * (1 + 1 / FINE_PX) + 2 * (1 + 1 / FINE_PX)  # Means of blocks, interpolation.
-
-
 @dataclass(frozen=True)
 class DetailStep:
     """The correction (G_2 - G_8) (y - H x) for images of one sensor.

@@ -47,8 +47,8 @@ from beers_deploy.model.consistency.blocks import (
     reached_blocks,
 )
 from beers_deploy.model.consistency.detail import (
+    FINE_PX,
     DetailStep,
-    products_per_px,
     separable_sums,
     window_weights,
 )
@@ -104,7 +104,10 @@ PRODUCTS_PER_PX = (
 about 30 more where an image is dark.
 """
 
-DETAIL_PRODUCTS_PER_PX = products_per_px(RANK, NEAR_PX)
+DETAIL_PRODUCTS_PER_PX = (
+    RANK * (FINE_PX + 2 * NEAR_PX) * (1 / FINE_PX + 1 / FINE_PX**2)  # The near part.
+    + 4 * (1 + 1 / FINE_PX)  # Means of blocks, and interpolation.
+)
 """The number of additional ones where the step corrects finer detail too."""
 
 EXCESS_SIGMAS = 6.0

@@ -5,6 +5,9 @@ pixels next to the brightest one of a point source hold on average 0.22 of its e
 lies in that pixel. With a lower MTF they hold more. A faulty pixel does not affect its neighbours.
 """
 
+from functools import reduce
+from itertools import product
+
 import numpy as np
 
 PATCH_PX = 4
@@ -61,31 +64,29 @@ def wrong_pixels(pixels: np.ndarray, step: float = 0.0) -> np.ndarray:
     size = 2 * PATCH_PX + 1
     if min(pixels.shape) < size:
         return np.empty((0, 2), np.int64)
-    places = _candidates(pixels)
+    # Pixels that lie clearly above, or below, all of their eight neighbours.
+    height, width = pixels.shape
+    centres = pixels[PATCH_PX : height - PATCH_PX, PATCH_PX : width - PATCH_PX]
+    neighbours = [
+        pixels[
+            PATCH_PX + down : height - PATCH_PX + down,
+            PATCH_PX + across : width - PATCH_PX + across,
+        ]
+        for down, across in product((-1, 0, 1), repeat=2)
+        if down or across
+    ]
+    above = reduce(np.maximum, neighbours)
+    below = reduce(np.minimum, neighbours)
+    steps = np.abs(np.diff(centres, axis=1))
+    least = CANDIDATE * float(np.nanmean(steps)) if np.isfinite(steps).any() else 0.0
+    out = np.maximum(centres - above, below - centres)
+    places = np.argwhere((out > 0) & (out >= least)) + PATCH_PX
     windows = np.lib.stride_tricks.sliding_window_view(pixels, (size, size))
     patches = windows[places[:, 0] - PATCH_PX, places[:, 1] - PATCH_PX].astype(np.float64)
     sufficient = np.isfinite(patches).sum((1, 2)) > MIN_VALID
     places = places[sufficient]
     patches = patches[sufficient]
     return np.asarray(places[_wrong(patches, step)]) if len(places) else places
-
-
-def _candidates(pixels: np.ndarray) -> np.ndarray:
-    """Return the places (n, 2) of pixels that lie clearly above, or below, all of their eight
-    neighbours.
-    """
-    height, width = pixels.shape
-    centres = pixels[PATCH_PX : height - PATCH_PX, PATCH_PX : width - PATCH_PX]
-    above = below = None
-    for down, across in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
-        rows = slice(PATCH_PX + down, height - PATCH_PX + down)
-        neighbours = pixels[rows, PATCH_PX + across : width - PATCH_PX + across]
-        above = neighbours if above is None else np.maximum(above, neighbours)
-        below = neighbours if below is None else np.minimum(below, neighbours)
-    step = np.abs(np.diff(centres, axis=1))
-    least = CANDIDATE * float(np.nanmean(step)) if np.isfinite(step).any() else 0.0
-    out = np.maximum(centres - above, below - centres)
-    return np.argwhere((out > 0) & (out >= least)) + PATCH_PX
 
 
 def _wrong(patches: np.ndarray, step: float) -> np.ndarray:

@@ -117,7 +117,12 @@ def judge_lines(blocks: Blocks, least: float) -> Stripes:
     errors = blocks.error[usable] / level
     # Blocks without scatter have the error 0, by which weights would be divided.
     errors = np.maximum(errors, 1e-6)
-    gains = _without_parity(gains)
+    # Without the part that alternate lines nearby have in common.
+    sign = 1 - 2.0 * (np.arange(gains.shape[1]) % 2)
+    bound = 3 * np.nanmedian(np.abs(gains), axis=1, keepdims=True)
+    alternating = np.clip(np.nan_to_num(gains) * sign, -bound, bound)
+    size = min(PARITY_LINES, gains.shape[1])
+    gains = gains - uniform_filter1d(alternating, size, axis=1, mode="nearest") * sign
     mean, error = _combined(gains, errors)
     spread, spread_error, significant = _spread(gains, errors)
     off = _single(mean, error, gains, errors, least)
@@ -128,16 +133,6 @@ def judge_lines(blocks: Blocks, least: float) -> Stripes:
         off=tuple(line for line in off if line.index not in set(dead.tolist())),
         dead=tuple(dead.tolist()),
     )
-
-
-def _without_parity(gains: np.ndarray) -> np.ndarray:
-    """Return (blocks, lines) without the part that alternate lines nearby have in common."""
-    sign = 1 - 2.0 * (np.arange(gains.shape[1]) % 2)
-    size = min(PARITY_LINES, gains.shape[1])
-    bound = 3 * np.nanmedian(np.abs(gains), axis=1, keepdims=True)
-    alternating = np.clip(np.nan_to_num(gains) * sign, -bound, bound)
-    shared = uniform_filter1d(alternating, size, axis=1, mode="nearest")
-    return np.asarray(gains - shared * sign)
 
 
 def _combined(gains: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -206,36 +201,23 @@ def _single(
             & agree
             & _alone(mean, error, -1.0)
         )
+        clear = np.abs(gains) > np.maximum(CLEAR * errors, PART)
+    # Some lines deviate in some of the blocks, such as a hot column below its hot pixel. Most
+    # blocks contain no evidence of such a line, so light must be excluded in each of the others.
+    alone = [_alone(*block, SURE) for block in zip(gains, errors, strict=True)]
+    isolated = (clear & np.array(alone)).sum(0)
+    partly = (isolated >= 2) & (4 * isolated >= 3 * clear.sum(0))
     # A line that is off in some blocks only is described by its largest deviation.
     farthest = np.argmax(np.abs(np.nan_to_num(gains)), axis=0)
     largest = np.where(off, mean, np.take_along_axis(gains, farthest[None], axis=0)[0])
     numbers = set[int]()
     lines = []
-    for index in sorted(
-        np.flatnonzero(off | _partly(gains, errors)), key=lambda index: -abs(largest[index])
-    ):
+    for index in sorted(np.flatnonzero(off | partly), key=lambda index: -abs(largest[index])):
         # The neighbours of a line that is off are off by half of it, to the other side.
         if not numbers & {index - 1, index + 1}:
             numbers.add(int(index))
             lines.append(Line(int(index), float(largest[index]), float(error[index])))
     return lines
-
-
-def _partly(gains: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """Return True for lines that deviate in some of the blocks, such as a hot column below its hot
-    pixel.
-
-    Most blocks contain no evidence of such a line, so light must be excluded in each of the others.
-    """
-    with np.errstate(invalid="ignore"):
-        clear = np.abs(gains) > np.maximum(CLEAR * errors, PART)
-    isolated = clear & np.array(
-        [
-            _alone(block_gains, block_errors, SURE)
-            for block_gains, block_errors in zip(gains, errors, strict=True)
-        ]
-    )
-    return np.asarray((isolated.sum(0) >= 2) & (4 * isolated.sum(0) >= 3 * clear.sum(0)))
 
 
 def _alone(second: np.ndarray, error: np.ndarray, margin: float) -> np.ndarray:

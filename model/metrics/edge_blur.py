@@ -103,16 +103,10 @@ def plain_squares(
     """
     if min(image.shape) <= 2 * MARGIN_PX:
         return np.empty((0, 2 * HALF_PX + 1, 2 * HALF_PX + 1))
-    squares = _squares(image, noise, effort)
-    valid = ((squares > 0) & (squares < clipped_at)).all((1, 2))
-    return squares[valid & _flat(squares, noise, roughness)][: effort.fits]
-
-
-def _squares(image: np.ndarray, noise: Noise, effort: Effort) -> np.ndarray:
-    """Cut squares (N, S, S) around the steepest places, none centred in the middle of another."""
     rows, columns = _steepest(_steepness(image, noise, effort.step_px), effort)
     occupied = np.zeros(image.shape, bool)
     numbers = list[int]()
+    # No square is centred in the middle of another.
     for k, (row, column) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True)):
         if not occupied[row, column]:
             occupied[row - HALF_PX : row + HALF_PX + 1, column - 3 : column + 4] = True
@@ -121,7 +115,9 @@ def _squares(image: np.ndarray, noise: Noise, effort: Effort) -> np.ndarray:
                 break
     reach = np.arange(-HALF_PX, HALF_PX + 1)
     rows, columns = (places[numbers][:, None, None] for places in (rows, columns))
-    return image[rows + reach[:, None], columns + reach]
+    squares = image[rows + reach[:, None], columns + reach]
+    valid = ((squares > 0) & (squares < clipped_at)).all((1, 2))
+    return squares[valid & _flat(squares, noise, roughness)][: effort.fits]
 
 
 def _steepest(steepness: np.ndarray, effort: Effort) -> tuple[np.ndarray, np.ndarray]:
@@ -284,23 +280,20 @@ def _of_shape(
     if other_gamma is not None and not shape:
         lean = np.array([edge.slope for edge in blurs]) ** 2
         gammas = np.sqrt(np.maximum(gammas**2 * (1 + lean) - lean * other_gamma**2, 1e-4))
-    gamma, error = _centre(gammas, errors)
+    # The weighted mean of the values within 3 robust deviations from the median.
+    if gammas.size == 1:
+        gamma = float(gammas[0])
+        error = math.hypot(float(errors[0]), LONE_ERROR)
+    else:
+        off = np.abs(gammas - np.median(gammas))
+        inliers = off <= 3 * np.maximum(ROBUST * float(np.median(off)), errors)
+        values = gammas[inliers]
+        variances = errors[inliers] ** 2
+        between = LONE_ERROR**2
+        if values.size > 1:
+            between = max(float(values.var(ddof=1)) - float(variances.mean()), 0.0)
+        weights = 1 / (variances + between)
+        gamma = float((weights * values).sum() / weights.sum())
+        error = float(weights.sum() ** -0.5)
     chi2 = [fit.chi2 if fit else WORST for fit in fits]
     return -gamma / 2 - shape / 4, error / 2, np.array(chi2)
-
-
-def _centre(values: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
-    """Compute the weighted mean of values (N,), and its standard error.
-
-    Values more than 3 robust deviations from the median are excluded.
-    """
-    if values.size == 1:
-        return float(values[0]), math.hypot(float(errors[0]), LONE_ERROR)
-    off = np.abs(values - np.median(values))
-    scatter = ROBUST * float(np.median(off))
-    inliers = off <= 3 * np.maximum(scatter, errors)
-    v = values[inliers]
-    e = errors[inliers]
-    between = max(float(v.var(ddof=1)) - float((e**2).mean()), 0.0) if v.size > 1 else LONE_ERROR**2
-    weights = 1 / (e**2 + between)
-    return float((weights * v).sum() / weights.sum()), float(weights.sum() ** -0.5)

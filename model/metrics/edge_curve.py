@@ -153,7 +153,16 @@ def measure_curve(edges: Sequence[Edge], generator: np.random.Generator) -> MtfC
         return Refusal("sharper than a detector's pixel: sharpened, or more than one edge in a box")
     values, errors = _softness(fitted, weights)
     draws = _drawn(fitted, weights, generator)
-    return _with_interval(weights, draws, fitted, _contradicting(fitted, values, errors), FLOOR)
+    # Edges whose softness is not the others'; of two that differ, both.
+    off = np.abs(values - float(np.median(values)))
+    scatter = MAD * float(np.median(off)) if len(fitted) > 3 else 0.0
+    contradicts = (off > CONTRADICTION_DEVIATIONS * np.hypot(errors, scatter)) & (
+        off > CONTRADICTION_PX
+    )
+    contradicting = tuple(
+        edge.pixels.label for edge, flag in zip(fitted, contradicts, strict=True) if flag
+    )
+    return _with_interval(weights, draws, fitted, contradicting, FLOOR)
 
 
 def search_curve(edges: Sequence[Edge], generator: np.random.Generator) -> MtfCurve | Refusal:
@@ -285,7 +294,19 @@ def _drawn(
     draws = []
     for _ in range(DRAWS):
         if count <= FEW_EDGES:
-            sample = [_drawn_along(edge, weights, generator) for edge in edges]
+            sample = []
+            # An edge's noise is drawn again, or its strips are drawn with replacement.
+            for edge, (gram, moment) in zip(edges, equations, strict=True):
+                if edge.unevenness > EVEN:
+                    strips = strips_of(edge)
+                    drawn = generator.integers(strips, size=strips)
+                    counts = np.bincount(drawn, minlength=strips)
+                    sample.append(normal_equations(edge, weights, counts))
+                    continue
+                # With noise of 1 in the pixels the moments have the covariance `gram`.
+                sizes, axes = np.linalg.eigh(gram)
+                deviations = np.sqrt(np.maximum(sizes, 0.0)) * generator.standard_normal(PARTS)
+                sample.append((gram, moment + axes @ deviations))
         else:
             sample = [equations[number] for number in generator.integers(count, size=count)]
         gram = np.sum([pair[0] for pair in sample], axis=0)
@@ -294,34 +315,6 @@ def _drawn(
         # loosest one, so that the interval holds what a smooth curve hides.
         draws.append(solve(gram, moment, weights, BENDS[-1], generator.standard_normal(PARTS - 3)))
     return draws
-
-
-def _drawn_along(
-    edge: FittedEdge, weights: np.ndarray, generator: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return an edge's normal equations with its noise drawn again, or its strips drawn with
-    replacement.
-    """
-    if edge.unevenness <= EVEN:
-        gram, moment = normal_equations(edge, weights)
-        # With noise of 1 in the pixels the moments have the covariance `gram`.
-        sizes, axes = np.linalg.eigh(gram)
-        noise = axes @ (np.sqrt(np.maximum(sizes, 0.0)) * generator.standard_normal(PARTS))
-        return gram, moment + noise
-    strips = strips_of(edge)
-    counts = np.bincount(generator.integers(strips, size=strips), minlength=strips)
-    return normal_equations(edge, weights, counts)
-
-
-def _contradicting(
-    edges: Sequence[FittedEdge], values: np.ndarray, errors: np.ndarray
-) -> tuple[str, ...]:
-    """Return the labels of edges whose softness is not the others'; of two that differ, both."""
-    centre = float(np.median(values))
-    off = np.abs(values - centre)
-    typical = np.hypot(errors, MAD * float(np.median(off)) if len(edges) > 3 else 0.0)
-    contradicts = (off > CONTRADICTION_DEVIATIONS * typical) & (off > CONTRADICTION_PX)
-    return tuple(edge.pixels.label for edge, flag in zip(edges, contradicts, strict=True) if flag)
 
 
 def _with_interval(

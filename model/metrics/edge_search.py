@@ -66,15 +66,6 @@ def find_edges(image: np.ndarray, noise: Noise, clipped_at: float, label: str) -
     ]
 
 
-def centre_line(region: np.ndarray) -> EdgeLine:
-    """Estimate the line of a near-vertical edge in a region (H, W) from the position of the rise in
-    each row.
-    """
-    rows, columns = (np.arange(size) - (size - 1) / 2 for size in region.shape)
-    lines = centroids(region[None], rows, columns)
-    return EdgeLine(float(lines.place[0]), float(np.clip(lines.slope[0], -MAX_SLOPE, MAX_SLOPE)))
-
-
 def edge_in(region: np.ndarray, noise: Noise, label: str) -> Edge | Refusal:
     """Find the one near-vertical edge that crosses a region from top to bottom, which a person has
     pointed at.
@@ -90,7 +81,14 @@ def edge_in(region: np.ndarray, noise: Noise, label: str) -> Edge | Refusal:
     scale = math.sqrt(float(noise(region).mean()))
     pixels = EdgePixels(region, noise(region), label)
     fit = fit_shape(region[None] / scale, ANY)[0]
-    line = EdgeLine(fit.place, fit.slope) if fit else centre_line(region)
+    if fit:
+        line = EdgeLine(fit.place, fit.slope)
+    else:
+        # From the position of the rise in each row.
+        rows, columns = (np.arange(size) - (size - 1) / 2 for size in region.shape)
+        rough = centroids(region[None], rows, columns)
+        slope = float(np.clip(rough.slope[0], -MAX_SLOPE, MAX_SLOPE))
+        line = EdgeLine(float(rough.place[0]), slope)
     fitted = fit_edge(pixels, line, START, FIRST_PASSES)
     if fitted is None or abs(fitted.line.slope) > MAX_SLOPE:
         return Refusal("no straight edge near to an axis with 8 pixels on both sides")

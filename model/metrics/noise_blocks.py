@@ -123,20 +123,10 @@ def _side_by_side(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _measured(mean: np.ndarray, pixels: np.ndarray, part: np.ndarray) -> Blocks:
     """Return blocks (N, S, S) with these means and parts by the energies of their bands."""
-    # Not by matrix products: the threads of BLAS wait for each other longer than these small sums
-    # take.
-    bands = np.einsum("nk,kb->bn", _energies(pixels).reshape(-1, SIDE_PX**2), _band_means())
-    slow, fine, *spectrum = bands
-    return Blocks(mean, slow, fine, np.stack(spectrum, axis=1), part)
-
-
-def _energies(pixels: np.ndarray) -> np.ndarray:
-    """Compute the squared cosine coefficients (N, S, S) of blocks after subtracting a plane from
-    each.
-    """
     # Imported here, and SciPy below: who measures no sensor need not wait for it.
     from scipy.fft import dctn
 
+    # A plane is subtracted from each block.
     ramp = np.arange(SIDE_PX) - (SIDE_PX - 1) / 2
     residuals = pixels - pixels.mean((1, 2), keepdims=True)
     down, across = (
@@ -144,7 +134,12 @@ def _energies(pixels: np.ndarray) -> np.ndarray:
     )
     residuals -= down[:, None, None] * ramp[:, None] + across[:, None, None] * ramp
     coefficients = dctn(residuals, axes=(1, 2), norm="ortho", overwrite_x=True)
-    return np.asarray(np.square(coefficients, out=coefficients))
+    energies = np.square(coefficients, out=coefficients).reshape(-1, SIDE_PX**2)
+    # Not by matrix products: the threads of BLAS wait for each other longer than these small sums
+    # take.
+    bands = np.einsum("nk,kb->bn", energies, _band_means())
+    slow, fine, *spectrum = bands
+    return Blocks(mean, slow, fine, np.stack(spectrum, axis=1), part)
 
 
 @cache

@@ -53,7 +53,13 @@ def edge_mtf(image: np.ndarray, angle_deg: float, saturated: float = math.inf) -
         why there is none.
     """
     pixels = np.asarray(image, np.float64)
-    distance = _unusable(pixels, saturated) or _distance(pixels, math.radians(angle_deg))
+    not_finite = int((~np.isfinite(pixels)).sum())
+    if not_finite:
+        return Refusal(f"{not_finite} pixels are not finite")
+    clipped = float(((pixels <= 0) | (pixels >= saturated)).mean())
+    if clipped > MAX_CLIPPED:
+        return Refusal(f"{clipped:.1%} of the pixels are clipped, {MAX_CLIPPED:.0%} at most")
+    distance = _distance(pixels, math.radians(angle_deg))
     if isinstance(distance, Refusal):
         return distance
     plateaus = _fit_plateaus(pixels, distance)
@@ -61,16 +67,6 @@ def edge_mtf(image: np.ndarray, angle_deg: float, saturated: float = math.inf) -
         contrast = f"a step of {plateaus.step:.4g} in noise of {plateaus.sigma:.4g}"
         return Refusal(f"{contrast}, {MIN_CONTRAST_SIGMA} times are needed")
     return _mtf(pixels, distance, plateaus)
-
-
-def _unusable(image: np.ndarray, saturated: float) -> Refusal | None:
-    not_finite = ~np.isfinite(image)
-    if not_finite.any():
-        return Refusal(f"{int(not_finite.sum())} pixels are not finite")
-    clipped = float(((image <= 0) | (image >= saturated)).mean())
-    if clipped > MAX_CLIPPED:
-        return Refusal(f"{clipped:.1%} of the pixels are clipped, {MAX_CLIPPED:.0%} at most")
-    return None
 
 
 def _distance(image: np.ndarray, angle: float) -> np.ndarray | Refusal:
@@ -195,20 +191,13 @@ def _mtf(image: np.ndarray, distance: np.ndarray, plateaus: Plateaus) -> float:
     residual = mean(values - plateaus.model(place / BINS_PER_PX, softness_px))
     shift = mean(place - bins)
     variance_px2 = float((mean((place - bins) ** 2) - shift**2).mean()) / BINS_PER_PX**2
-    correction = _transform(variance_px2) @ _at_centres(residual, shift) / plateaus.step
+    # With few rows or an unlucky angle (a slope of 1/4) the pixels of a bin lie on one side of its
+    # centre: its mean is corrected to the centre, to second order.
+    position = np.arange(residual.size) + shift
+    slope = np.gradient(residual, position)
+    at_centres = residual - shift * slope + shift**2 / 2 * np.gradient(slope, position)
+    correction = _transform(variance_px2) @ at_centres / plateaus.step
     return float(plateaus.transfer(NYQUIST, softness_px) + correction)
-
-
-def _at_centres(averages: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Correct bin averages from the mean position of their pixels to the bin centres, to second
-    order.
-
-    With few rows or an unlucky angle (a slope of 1/4) the pixels of a bin lie on one side of its
-    centre.
-    """
-    place = np.arange(averages.size) + shift
-    slope = np.gradient(averages, place)
-    return np.asarray(averages - shift * slope + shift**2 / 2 * np.gradient(slope, place))
 
 
 def _transform(variance_px2: float) -> np.ndarray:
@@ -252,8 +241,12 @@ def slanted_edge(
     place = np.arange(-2, side_px * oversampling + 2) - (side_px * oversampling - 1) / 2
     distance = place[None, :] * math.cos(angle) + place[:, None] * math.sin(angle)
     covered = _covered(distance, abs(math.cos(angle)), abs(math.sin(angle)))
+    # 1/24 of the second differences compensates the blur of a box of one pixel. The result is 2
+    # pixels a side shorter.
+    rows = covered[1:-1] - (covered[2:] - 2 * covered[1:-1] + covered[:-2]) / 24
+    both = rows[:, 1:-1] - (rows[:, 2:] - 2 * rows[:, 1:-1] + rows[:, :-2]) / 24
     left, right = radiance
-    return np.asarray(left + (right - left) * _sharpened(covered), np.float32)
+    return np.asarray(left + (right - left) * both[1:-1, 1:-1], np.float32)
 
 
 def _covered(distance: np.ndarray, width: float, height: float) -> np.ndarray:
@@ -270,13 +263,3 @@ def _covered(distance: np.ndarray, width: float, height: float) -> np.ndarray:
         (sa * sb, distance + (sa * large + sb * small) / 2) for sa, sb in product((1, -1), repeat=2)
     ]
     return np.asarray(sum(sign * np.maximum(x, 0) ** 2 for sign, x in ramps) / (2 * small * large))
-
-
-def _sharpened(image: np.ndarray) -> np.ndarray:
-    """Subtract 1/24 of the second differences, which compensates the blur of a box of one pixel.
-
-    The result is 2 pixels a side shorter.
-    """
-    rows = image[1:-1] - (image[2:] - 2 * image[1:-1] + image[:-2]) / 24
-    both = rows[:, 1:-1] - (rows[:, 2:] - 2 * rows[:, 1:-1] + rows[:, :-2]) / 24
-    return np.asarray(both[1:-1, 1:-1])

@@ -138,7 +138,13 @@ def scene_of(name: str, pixels: np.ndarray, sensor: Instrument) -> Scene:
     """
     radiance: np.ndarray
     if pixels.dtype == np.uint8:
-        radiance = _linear(pixels) * (sensor.max_dn / sensor.gain_dn_per_radiance)
+        # 8-bit sRGB becomes linear light in [0, 1] (IEC 61966-2-1), and bands are averaged.
+        # scikit-image linearises only in its conversion to XYZ, which weights them as an eye does.
+        code = np.arange(256) / 255
+        curve = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+        light = curve.astype(np.float32)[pixels]
+        light = light if light.ndim == 2 else light[..., :3].mean(axis=-1)
+        radiance = light * (sensor.max_dn / sensor.gain_dn_per_radiance)
     elif pixels.ndim == 2 and pixels.dtype == np.uint16:
         radiance = pixels.astype(np.float32) / np.float32(sensor.gain_dn_per_radiance)
     elif pixels.ndim == 2 and np.issubdtype(pixels.dtype, np.floating):
@@ -160,18 +166,3 @@ def scene_of(name: str, pixels: np.ndarray, sensor: Instrument) -> Scene:
             full,
         )
     return Scene(name, np.ascontiguousarray(radiance, dtype=np.float32))
-
-
-def _linear(pixels: np.ndarray) -> np.ndarray:
-    """Convert 8-bit sRGB, (H, W) or (H, W, bands), to linear light (H, W) in [0, 1] (IEC
-    61966-2-1).
-
-    The bands are averaged. scikit-image linearises only in its conversion to XYZ, which weights the
-    bands as an eye does.
-    """
-    code = np.arange(256) / 255
-    table = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(
-        np.float32
-    )
-    light: np.ndarray = table[pixels]
-    return light if light.ndim == 2 else light[..., :3].mean(axis=-1)

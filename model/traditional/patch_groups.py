@@ -144,7 +144,11 @@ def estimate_groups(
     mean, centred, covariance = _moments(noisy, mask)
     if guide is not noisy:
         covariance = _moments(guide, mask)[2]
-    flat = _is_flat(mean, covariance, 0.0 if settings.clean_guide else FLAT_GAMMA * noise.sigma**2)
+    # The variance of all pixels of a group is that within the k * k positions (the trace) plus that
+    # between them. Both sums are small, whereas in the sum of the squared pixels sigma^2 would be
+    # lost in float32.
+    variance = covariance.diagonal(dim1=1, dim2=2).mean(1) + mean[:, 0].var(1, correction=0)
+    flat = variance < (0.0 if settings.clean_guide else FLAT_GAMMA * noise.sigma**2)
     shrinkage = torch.zeros_like(covariance)
     shrinkage[~flat] = _shrinkage(covariance[~flat], noise, settings)
     estimates = torch.baddbmm(noisy, centred, shrinkage, alpha=-1)
@@ -168,16 +172,6 @@ def _moments(patches: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tens
     mean = share[:, None] @ patches
     centred = patches - mean
     return mean, centred, centred.mT @ (centred * share[..., None])
-
-
-def _is_flat(mean: Tensor, covariance: Tensor, bound: float) -> Tensor:
-    """Return True for each group (B,) if the variance of all its pixels is below `bound`.
-
-    The variance is that within the k * k positions (the trace) plus that between them. Both sums
-    are small, whereas in the sum of the squared pixels sigma^2 would be lost in float32.
-    """
-    within = covariance.diagonal(dim1=1, dim2=2).mean(1)
-    return within + mean[:, 0].var(1, correction=0) < bound
 
 
 def _shrinkage(covariance: Tensor, noise: Noise, settings: PassSettings) -> Tensor:
