@@ -63,27 +63,18 @@ class Weights:
 def write_tensors(path: Path, tensors: Arrays, header: Mapping[str, object]) -> None:
     """Write named arrays of any shape and a JSON header as safetensors, whole or not at all."""
     contiguous = {name: np.asarray(array, order="C") for name, array in tensors.items()}
-    with whole_file(path) as temporary:
-        # The library's own writer reports a full disk with an error of its own.
-        temporary.write_bytes(
-            save(contiguous, metadata={key: json.dumps(value) for key, value in header.items()})
-        )
-        _sort_metadata(temporary)
-
-
-def _sort_metadata(path: Path) -> None:
-    """Sort the metadata of a safetensors file by key, because the library writes it in random
-    order.
-    """
-    content = path.read_bytes()
-    # The file begins with the length of its JSON header, in 8 bytes.
+    content = save(contiguous, metadata={key: json.dumps(value) for key, value in header.items()})
+    # The file begins with the length of its JSON header, in 8 bytes. The library writes the
+    # metadata in it in random order, so they are sorted by key.
     end = 8 + int.from_bytes(content[:8], "little")
-    header = json.loads(content[8:end])
-    header["__metadata__"] = dict(sorted(header.get("__metadata__", {}).items()))
-    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    stored = json.loads(content[8:end])
+    stored["__metadata__"] = dict(sorted(stored.get("__metadata__", {}).items()))
+    text = json.dumps(stored, separators=(",", ":"), ensure_ascii=False).encode()
     # The tensors begin at a multiple of 8.
     text += b" " * (-len(text) % 8)
-    path.write_bytes(len(text).to_bytes(8, "little") + text + content[end:])
+    with whole_file(path) as temporary:
+        # The library's own writer reports a full disk with an error of its own.
+        temporary.write_bytes(len(text).to_bytes(8, "little") + text + content[end:])
 
 
 def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
@@ -138,7 +129,15 @@ def read_weights(path: Path) -> Weights:
         # Before a list of the network's is made: a header alone must not take memory.
         if len(tensors) != 4 * variant.blocks + (7 if conditioned else 6):
             raise ValueError(f"it has {len(tensors)} tensors for {variant}")
-        _check_like(tensors, variant.banked_shapes if conditioned else variant.shapes)
+        shapes = variant.banked_shapes if conditioned else variant.shapes
+        for name, expected in shapes.items():
+            if tensors[name].shape != expected:
+                raise ValueError(
+                    f"{name} has the shape {tensors[name].shape} instead of {expected}"
+                )
+        is_float32 = all(tensor.dtype == np.float32 for tensor in tensors.values())
+        if not is_float32 or not all_finite(tensors):
+            raise ValueError("its weights are not finite float32")
     except FAULTS as error:
         reason = reason_of(error)
         if isinstance(error, KeyError):
@@ -200,16 +199,3 @@ def _conditioned(header: Mapping[str, object]) -> bool:
     if kind and header.get("ranges") != {name: list(ends) for name, ends in RANGES.items()}:
         raise ValueError("its ranges of sensors differ from those of this version")
     return kind is not None
-
-
-def _check_like(tensors: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Raise ValueError if the tensors differ in shape from those of a network, or are not finite
-    float32.
-    """
-    for name, shape in shapes.items():
-        if tensors[name].shape != shape:
-            raise ValueError(f"{name} has the shape {tensors[name].shape} instead of {shape}")
-    if not all(tensor.dtype == np.float32 for tensor in tensors.values()) or not all_finite(
-        tensors
-    ):
-        raise ValueError("its weights are not finite float32")

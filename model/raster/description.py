@@ -47,10 +47,24 @@ def raster_of(path: Path, dataset: Any) -> Raster:
             several pages, or is too large.
     """
     name = str(path)
-    _require_one_image(name, dataset)
+    # The pages of a TIFF are several images.
+    count = len(dataset.subdatasets)
+    if dataset.count == 0 or count > 1:
+        how = f" with 'gdal_translate {dataset.subdatasets[0]} one.tif'" if count else ""
+        raise ImageError(
+            f"{name} must hold one image, got {count}. Save the one that you mean as a file of its "
+            f"own{how}."
+        )
     mask_kind = _mask_kind(name, dataset)
     bands = dataset.count - (mask_kind == "alpha")
-    _require_alike(name, dataset, bands)
+    for kind, values in (
+        ("types", dataset.dtypes),
+        ("nodata values", dataset.nodatavals[:bands]),
+    ):
+        texts = [str(value) for value in values]
+        if len(set(texts)) > 1:
+            stated = printable(", ".join(texts))
+            raise ImageError(f"{name} has bands of different {kind}: {stated}. Split the bands.")
     dtype = require_numbers(name, np.dtype(dataset.dtypes[0]))
     require_size(name, bands, dataset.height, dataset.width)
     _require_light(name, dataset)
@@ -58,6 +72,7 @@ def raster_of(path: Path, dataset: Any) -> Raster:
         require_small_offset(name, offset, scale)
     colours = [values.name for values in dataset.colorinterp]
     tags = dataset.tags()
+    points, points_crs = dataset.gcps
     return Raster(
         bands,
         dataset.height,
@@ -68,7 +83,14 @@ def raster_of(path: Path, dataset: Any) -> Raster:
         mask_kind=mask_kind,
         colour=colours[:bands] == list(RGB_BANDS),
         restored=is_restored(tags.get("TIFFTAG_SOFTWARE", ""), tags),
-        place=_place(dataset),
+        # A transform, or ground control points.
+        place=Place(
+            crs=points_crs if points else dataset.crs,
+            transform=None if points or dataset.transform.is_identity else dataset.transform,
+            gcps=tuple((at.row, at.col, at.x, at.y, at.z or 0.0) for at in points),
+            rpcs=tuple(sorted(dataset.tags(ns="RPC").items())),
+            area_or_point=tags.get("AREA_OR_POINT", ""),
+        ),
         band_info=tuple(
             BandInfo(
                 dataset.descriptions[band] or "",
@@ -81,17 +103,6 @@ def raster_of(path: Path, dataset: Any) -> Raster:
         ),
         tags=_retained_tags(tags),
     )
-
-
-def _require_one_image(name: str, dataset: Any) -> None:
-    """Raise ImageError if a file has several images, such as the pages of a TIFF."""
-    count = len(dataset.subdatasets)
-    if dataset.count == 0 or count > 1:
-        how = f" with 'gdal_translate {dataset.subdatasets[0]} one.tif'" if count else ""
-        raise ImageError(
-            f"{name} must hold one image, got {count}. Save the one that you mean as a file of its "
-            f"own{how}."
-        )
 
 
 def _mask_kind(name: str, dataset: Any) -> MaskKind:
@@ -113,17 +124,6 @@ def _mask_kind(name: str, dataset: Any) -> MaskKind:
     if is_alpha[-1]:
         return "alpha"
     return "mask" if has_mask else ""
-
-
-def _require_alike(name: str, dataset: Any, bands: int) -> None:
-    """Raise ImageError if bands differ in type or nodata value."""
-    for kind, values in (
-        ("types", dataset.dtypes),
-        ("nodata values", dataset.nodatavals[:bands]),
-    ):
-        if len({str(value) for value in values}) > 1:
-            stated = printable(", ".join(str(value) for value in values))
-            raise ImageError(f"{name} has bands of different {kind}: {stated}. Split the bands.")
 
 
 def _require_light(name: str, dataset: Any) -> None:
@@ -156,19 +156,6 @@ def _bits(path: Path, dataset: Any) -> int | None:
     most = max((int(text) for text in texts if text.isdecimal()), default=0)
     # Bits that fill the type describe the container, not the sensor.
     return most if 0 < most < 8 * np.dtype(dataset.dtypes[0]).itemsize else None
-
-
-def _place(dataset: Any) -> Place:
-    """Return where an image lies on Earth: by a transform, or by ground control points."""
-    points, points_crs = dataset.gcps
-    identity = dataset.transform.is_identity
-    return Place(
-        crs=points_crs if points else dataset.crs,
-        transform=None if points or identity else dataset.transform,
-        gcps=tuple((point.row, point.col, point.x, point.y, point.z or 0.0) for point in points),
-        rpcs=tuple(sorted(dataset.tags(ns="RPC").items())),
-        area_or_point=dataset.tags().get("AREA_OR_POINT", ""),
-    )
 
 
 def _retained_tags(tags: dict[str, str]) -> tuple[tuple[str, str], ...]:

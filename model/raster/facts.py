@@ -92,18 +92,16 @@ class Place:
             coefficients[key] = repr((_number(coefficients[key]) + 0.5) * scale - 0.5)
         for key in coefficients.keys() & {"LINE_SCALE", "SAMP_SCALE"}:
             coefficients[key] = repr(_number(coefficients[key]) * scale)
+        transform = self.transform
+        if transform is not None:
+            a, b, c, d, e, f = transform[:6]
+            transform = type(transform)(a / scale, b / scale, c, d / scale, e / scale, f)
         return replace(
             self,
-            transform=self.transform and _of_smaller_pixels(self.transform, scale),
+            transform=transform,
             gcps=points,
             rpcs=tuple(coefficients.items()),
         )
-
-
-def _of_smaller_pixels(transform: Any, scale: float) -> Any:
-    """Return the affine transform of pixels that are `scale` times smaller along either side."""
-    a, b, c, d, e, f = transform[:6]
-    return type(transform)(a / scale, b / scale, c, d / scale, e / scale, f)
 
 
 def _number(text: str) -> float:

@@ -130,26 +130,21 @@ def _named(index: Path, home: Path, trusted: bool) -> Iterator[Path]:
         if trusted and _is_elsewhere(text):
             continue
         file = _located(index, text, folder, None if trusted else home)
-        if pixels:
-            _require_pixels(index, text, file)
+        if pixels and not file.is_file():
+            raise ImageError(
+                f"{index} names the tile '{printable(text)}', but there is no such file. Fetch it, "
+                "or write the index again."
+            )
+        if pixels and file.suffix.lower() != ".vrt":
+            with file.open("rb") as stream:
+                is_image = stream.read(16).startswith(MAGIC)
+            if not is_image:
+                raise ImageError(
+                    f"{index} names the tile '{printable(text)}', which is not a TIFF, JPEG 2000, "
+                    "NITF, PNG or JPEG. Convert it to TIFF."
+                )
         if pixels or (is_index(file) and file.is_file()):
             yield file
-
-
-def _require_pixels(index: Path, text: str, file: Path) -> None:
-    """Raise ImageError if a tile does not exist, or is neither an image nor a VRT."""
-    if not file.is_file():
-        raise ImageError(
-            f"{index} names the tile '{printable(text)}', but there is no such file. Fetch it, or "
-            "write the index again."
-        )
-    with file.open("rb") as stream:
-        is_image = stream.read(16).startswith(MAGIC)
-    if not is_image and file.suffix.lower() != ".vrt":
-        raise ImageError(
-            f"{index} names the tile '{printable(text)}', which is not a TIFF, JPEG 2000, NITF, "
-            "PNG or JPEG. Convert it to TIFF."
-        )
 
 
 def _parsed(path: Path) -> ET.Element:

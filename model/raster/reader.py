@@ -122,11 +122,24 @@ def open_raster(path: Path, trusted: bool = False) -> Iterator[Source]:
     with dataset:
         with damage_in_a_sentence(path), gdal(**options):
             files = _files(path, tiles, dataset, trusted)
-            block_px = _block_px(dataset, [tile for tile in tiles if not is_index(tile)])
+            rows = [int(rows) for rows, _ in dataset.block_shapes]
+            # A mosaic states blocks of its own, but decodes those of its tiles, which are mostly
+            # alike.
+            for file in [tile for tile in tiles if not is_index(tile)][:1]:
+                with rasterio.open(file) as tile:
+                    rows += [int(tile_rows) for tile_rows, _ in tile.block_shapes]
             raster = raster_of(path, dataset)
             _require_whole(path, dataset)
-        source = GdalSource(files, dataset, raster, block_px, options)
-        _require_memory(path, source)
+        source = GdalSource(files, dataset, raster, max(rows, default=1), options)
+        needed = source.held_bytes(1)
+        free = psutil.virtual_memory().available
+        # Checked before a strip or tile is decoded.
+        if needed > max(free, 2 * LEAST_CACHE_BYTES):
+            room, size = sizes(free, needed)
+            raise MachineError(
+                f"{path} needs {size} for two of its strips or tiles, but there is only {room} of "
+                "free memory. Rewrite it in smaller tiles (gdal_translate -co TILED=YES)."
+            )
         yield source
 
 
@@ -184,16 +197,6 @@ def _files(path: Path, tiles: tuple[Path, ...], dataset: Any, trusted: bool) -> 
     # GDAL lists a mask next to the image among its files only after the mask has been read.
     mask = mask_file(path)
     return tuple(files | ({mask: None} if mask.is_file() else {}))
-
-
-def _block_px(dataset: Any, tiles: list[Path]) -> int:
-    """Return the rows of the blocks in which an image is decoded."""
-    rows = [int(rows) for rows, _ in dataset.block_shapes]
-    # A mosaic states blocks of its own, but decodes those of its tiles, which are mostly alike.
-    if tiles:
-        with rasterio.open(tiles[0]) as tile:
-            rows += [int(tile_rows) for tile_rows, _ in tile.block_shapes]
-    return max(rows, default=1)
 
 
 @contextmanager
@@ -306,17 +309,3 @@ def _require_whole(path: Path, dataset: Any) -> None:
                 f"{path} is not a readable TIFF, because it is cut short at {size} of "
                 f"{offset + count} bytes. Copy it again."
             )
-
-
-def _require_memory(path: Path, source: GdalSource) -> None:
-    """Raise MachineError if the strips or tiles of an image do not fit in memory, before one is
-    decoded.
-    """
-    needed = source.held_bytes(1)
-    free = psutil.virtual_memory().available
-    if needed > max(free, 2 * LEAST_CACHE_BYTES):
-        room, size = sizes(free, needed)
-        raise MachineError(
-            f"{path} needs {size} for two of its strips or tiles, but there is only {room} of free "
-            "memory. Rewrite it in smaller tiles (gdal_translate -co TILED=YES)."
-        )
