@@ -99,7 +99,14 @@ def _accumulated(core: IntCore, op: IntConv | Op, inputs: list[Range]) -> Accumu
     if isinstance(op, IntConv):
         return _conv(core, op, inputs[0])
     if isinstance(op, Add):
-        return _whole_add(core, op, inputs)
+        finest = max(core.frac_bits[name] for name in op.inputs)
+        shifts = [finest - core.frac_bits[name] for name in op.inputs]
+        ends = (
+            sum(span[k].astype(np.int64) << s for span, s in zip(inputs, shifts, strict=True))
+            for k in (0, 1)
+        )
+        (low, finer), (high, _) = (activated(np.asarray(e), op.activation, finest) for e in ends)
+        return low, high, finest - core.frac_bits[op.output] + finer
     if isinstance(op, Mul):
         # A product is linear in each factor, so its extremes lie at the ends of both intervals.
         corners = np.array([a.astype(np.int64) * b for a, b in product(inputs[0], inputs[1])])
@@ -155,16 +162,6 @@ def _conv(core: IntCore, op: IntConv, source: Range) -> Accumulated:
         activated(end, op.activation, product_bits) for end in (least, most)
     )
     return least, most, product_bits - core.frac_bits[op.output] + finer
-
-
-def _whole_add(core: IntCore, op: Add, inputs: list[Range]) -> Accumulated:
-    finest = max(core.frac_bits[name] for name in op.inputs)
-    shifts = [finest - core.frac_bits[name] for name in op.inputs]
-    ends = (
-        sum(r[k].astype(np.int64) << s for r, s in zip(inputs, shifts, strict=True)) for k in (0, 1)
-    )
-    (low, finer), (high, _) = (activated(np.asarray(end), op.activation, finest) for end in ends)
-    return low, high, finest - core.frac_bits[op.output] + finer
 
 
 def _shifted(sums: np.ndarray, shift: int) -> np.ndarray:

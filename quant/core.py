@@ -218,22 +218,19 @@ def build_core(
     for _ in range(ROUNDS):
         core = _in_one_round(graph, legal, shifts, host_part, earlier)
         faults = shift_faults(core, shifts)
-        if not faults:
-            return _with_biases_left(core, graph)
+        if faults:
+            continue
+        # The host adds the rounding error of the last biases, if it adds offsets.
+        last = graph[-1]
+        rounded = core.ops[-1]
+        if isinstance(last, Conv) and isinstance(rounded, IntConv):
+            decoding = host_part.decoding.with_bias_errors(last.bias - rounded.float_bias)
+            core = replace(core, host_part=replace(host_part, decoding=decoding))
+        return core
     raise ModelError(
         f"The network cannot be quantised, because the DPU's shifts do not reach all its values "
         f"({faults[0]}). Look for weights that are far too large or too small."
     )
-
-
-def _with_biases_left(core: IntCore, graph: Graph) -> IntCore:
-    """Return the core whose host adds the rounding error of the last biases, if it adds offsets."""
-    last = graph[-1]
-    rounded = core.ops[-1]
-    if not (isinstance(last, Conv) and isinstance(rounded, IntConv)):
-        return core
-    decoding = core.host_part.decoding.with_bias_errors(last.bias - rounded.float_bias)
-    return replace(core, host_part=replace(core.host_part, decoding=decoding))
 
 
 def _in_one_round(
@@ -258,13 +255,22 @@ def _in_one_round(
             ops.append(rounded)
             continue
         if isinstance(op, Add):
-            _move_add(op, frac_bits, shifts)
+            # The coarsest input stays, for a finer scale would make it clip; finer inputs come
+            # nearer.
+            coarse = min(frac_bits[name] for name in op.inputs)
+            for name in op.inputs:
+                frac_bits[name] = coarse + clamp(frac_bits[name] - coarse, shifts.read)
+            frac_bits[op.output] = coarse - clamp(coarse - frac_bits[op.output], shifts.write)
         elif isinstance(op, Mul):
             # A product has the fractional bits of both factors; only the result's scale can move.
             finest = sum(frac_bits[name] for name in op.inputs)
             frac_bits[op.output] = finest - clamp(finest - frac_bits[op.output], shifts.cut)
         elif ties_scales(op):
-            _tie(op, frac_bits)
+            # Inputs and output have one scale: the coarsest of them, because a finer one clips, or
+            # that of the planes, which the host writes.
+            names = (*op.inputs, op.output)
+            shared = frac_bits[PLANES] if PLANES in names else min(frac_bits[n] for n in names)
+            frac_bits.update(dict.fromkeys(names, shared))
         ops.append(op)
     return IntCore(tuple(ops), dict(frac_bits), host_part)
 
@@ -317,24 +323,6 @@ def quantize_bias(
     best = best_frac_bits(bias) if bias.any() else product
     frac_bits = product - clamp(product - best, shifts.bias)
     return quantize(bias, frac_bits), frac_bits
-
-
-def _move_add(op: Add, frac_bits: dict[str, int], shifts: Shifts) -> None:
-    # The coarsest input stays, for a finer scale would make it clip; finer inputs come nearer.
-    coarse = min(frac_bits[i] for i in op.inputs)
-    for name in op.inputs:
-        frac_bits[name] = coarse + clamp(frac_bits[name] - coarse, shifts.read)
-    frac_bits[op.output] = coarse - clamp(coarse - frac_bits[op.output], shifts.write)
-
-
-def _tie(op: Op, frac_bits: dict[str, int]) -> None:
-    """Set one scale for all inputs and the output: the coarsest of them, or that of the planes,
-    which is fixed.
-    """
-    names = (*op.inputs, op.output)
-    # The host writes the planes with a scale of their own; a finer scale than the coarsest clips.
-    shared = frac_bits[PLANES] if PLANES in names else min(frac_bits[name] for name in names)
-    frac_bits.update(dict.fromkeys(names, shared))
 
 
 def shift_faults(core: IntCore, shifts: Shifts = SHIFTS) -> list[str]:

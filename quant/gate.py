@@ -340,7 +340,13 @@ def gate_row(result: GateResult, shares: Mapping[str, float] | None = None) -> R
         for name, (value, unit) in entries.items()
     }
     if shares is not None:
-        figures["saturated results"] = _saturation(shares, result.source)
+        # The largest share of a layer's results at the ends of 8 bits, with the layer.
+        saturation = unavailable("%", "no result in the file is rounded to 8 bits")
+        if shares:
+            layer = max(shares, key=lambda name: shares[name])
+            source = f"{layer}, the worst of {len(shares)}; {result.source}"
+            saturation = measured(100 * shares[layer], "%", source)
+        figures["saturated results"] = saturation
     return Row("gate", "INT8 against float", figures)
 
 
@@ -360,11 +366,3 @@ def figure_of(value: float, unit: str, source: str, missing: str) -> Figure:
     if math.isnan(value):
         return unavailable(unit, missing)
     return measured(value, unit, source)
-
-
-def _saturation(shares: Mapping[str, float], source: str) -> Figure:
-    """Return the largest share of a layer's results at the ends of 8 bits, with the layer."""
-    if not shares:
-        return unavailable("%", "no result in the file is rounded to 8 bits")
-    layer = max(shares, key=lambda name: shares[name])
-    return measured(100 * shares[layer], "%", f"{layer}, the worst of {len(shares)}; {source}")

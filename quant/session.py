@@ -23,7 +23,6 @@ from beers_deploy.quant.graph import (
     Conv,
     Graph,
     Mul,
-    Op,
     Pointwise,
     same,
 )
@@ -281,15 +280,13 @@ def halo_of(graph: Graph) -> int | None:
         other operations than adds, products, concats, activations and convolutions that preserve
         the size.
     """
-    if not all(
-        isinstance(op, Add | Mul | Concat | Pointwise) or _keeps_lattice(op) for op in graph
-    ):
-        return None
-    return sum(max(op.window.pads) for op in graph if isinstance(op, Conv))
-
-
-def _keeps_lattice(op: Op) -> bool:
-    return isinstance(op, Conv) and not op.transposed and op.window == same(op.weight)
+    halo_px = 0
+    for op in graph:
+        if isinstance(op, Conv) and not op.transposed and op.window == same(op.weight):
+            halo_px += max(op.window.pads)
+        elif not isinstance(op, Add | Mul | Concat | Pointwise):
+            return None
+    return halo_px
 
 
 def _places(

@@ -248,29 +248,14 @@ def count_relus(model: onnx.ModelProto) -> Relus:
         convolutions = [node for node in graph.nodes if "Conv" in node.op_type]
         convolved = set(chain.from_iterable(node.outputs for node in convolutions))
         explicit = sum(_is_relu(node, graph, tensors) for node in nodes)
-        n_folded = sum(_begins_at_zero(node, tensors, convolved) for node in graph.nodes)
-        return Relus(explicit, n_folded)
-
-
-def _bent_by_relu(model: onnx.ModelProto, core: IntCore | None) -> int:
-    """Return the number of LeakyReLUs and PReLUs that the integers compute by a ReLU in a second
-    branch, and of Tanhs that they compute by a ReLU6.
-
-    `quant.adapt` replaces them so. They are counted as those of the float network, less the
-    LeakyReLUs of the integers and the Tanh of the host.
-
-    Args:
-        model: the float network.
-        core: its integer core, or None if the file describes none.
-    """
-    if core is None:
-        return 0
-    bent = sum(node.op_type in ("LeakyRelu", "PRelu", "Tanh") for node in model.graph.node)
-    left = sum(
-        isinstance(op, IntConv | Pointwise) and op.activation is Activation.leaky_relu
-        for op in core.ops
-    )
-    return bent - left - (core.host_part.activation == "Tanh")
+        folded = 0
+        for node in graph.nodes:
+            value = tensors.get(node.outputs[0])
+            is_convolved = node.op_type == "QLinearConv" or convolved.intersection(node.inputs[:1])
+            # All numbers of a convolution's result are at least zero.
+            if value is not None and is_convolved:
+                folded += set(value.scale.zero_points) == {value.lowest}
+        return Relus(explicit, folded)
 
 
 def _is_relu(node: Node, graph: OnnxGraph, tensors: dict[str, Rounded]) -> bool:
@@ -289,37 +274,15 @@ def _is_relu(node: Node, graph: OnnxGraph, tensors: dict[str, Rounded]) -> bool:
         zeros = [tensors[name].scale.zero_points for name in node.inputs if name in tensors]
         zeros = zeros or [(0,)]
         return bool((constants[0] == np.array(zeros[0])).all())
-    return node.op_type == "Relu" or (
-        node.op_type == "Gather" and _is_table_of_relu(graph.value(node, 0))
-    )
-
-
-def _is_table_of_relu(table: np.ndarray | None) -> bool:
-    """Return True if a table maps values below zero to zero, and others to values that do not
-    decrease.
-
-    Our files store a ReLU that follows no convolution as such a table of uint8, around ZERO.
-    """
+    table = graph.value(node, 0) if node.op_type == "Gather" else None
     if table is None or table.shape != (TABLE,) or table.dtype != np.uint8:
-        return False
+        return node.op_type == "Relu"
+    # Our files store a ReLU that follows no convolution as a table of uint8, around ZERO. It maps
+    # values below zero to zero, and others to values that do not decrease.
     values = table.astype(np.int16) - ZERO
     return bool(
         (values[:ZERO] == 0).all() and (np.diff(values[ZERO:]) >= 0).all() and values[-1] > 0
     )
-
-
-def _begins_at_zero(node: Node, tensors: dict[str, Rounded], convolved: set[str]) -> bool:
-    """Return True if a convolution's result is rounded to numbers that are all at least zero.
-
-    Args:
-        node: any node.
-        tensors: the tensors of 8 bits by name.
-        convolved: names of the results of all convolutions.
-    """
-    value = tensors.get(node.outputs[0])
-    if value is None or not (node.op_type == "QLinearConv" or node.inputs[0] in convolved):
-        return False
-    return set(value.scale.zero_points) == {value.lowest}
 
 
 def structure_checks(
@@ -340,7 +303,15 @@ def structure_checks(
         is described, layers that are computed in float, and the difference of the results with and
         without optimisations of onnxruntime.
     """
-    image = np.random.default_rng(0).random(_odd_size(int8), dtype=np.float32)
+    # An image that the network accepts: free sides are 97 and 101 pixels, rounded up to multiples
+    # of the network's lattice.
+    sizes = [side.dim_value for side in int8.graph.input[0].type.tensor_type.shape.dim]
+    alignment_px = 1 if sizes[2] else tiling_of(int8).alignment_px
+    rows, columns = (
+        fixed or -(-n // alignment_px) * alignment_px
+        for fixed, n in zip(sizes[2:], (97, 101), strict=True)
+    )
+    image = np.random.default_rng(0).random((1, sizes[1] or 1, rows, columns), dtype=np.float32)
     # On a processor without VNNI the unoptimised graph was up to 126 DN off, because onnxruntime's
     # exact setting is one of its optimisations.
     plain, optimised = (result_of(open_any_size(int8, optimise=o), image) for o in (False, True))
@@ -348,7 +319,18 @@ def structure_checks(
     optimisation = Check("optimised against unoptimised", difference, 0, "of full scale")
     float_relus = count_relus(float_model).explicit
     int8_relus = count_relus(int8)
-    float_relus += _bent_by_relu(float_model, _own_core(int8))
+    if (core := _own_core(int8)) is not None:
+        # `quant.adapt` computes LeakyReLUs and PReLUs by a ReLU in a second branch, and a Tanh by a
+        # ReLU6. They are those of the float network less the LeakyReLUs of the integers and the
+        # Tanh of the host.
+        float_relus += sum(
+            node.op_type in ("LeakyRelu", "PRelu", "Tanh") for node in float_model.graph.node
+        )
+        float_relus -= sum(
+            isinstance(op, IntConv | Pointwise) and op.activation is Activation.leaky_relu
+            for op in core.ops
+        )
+        float_relus -= core.host_part.activation == "Tanh"
     detail = f"{float_relus} in float, {int8_relus} in INT8"
     faults = encoding_faults(int8)
     checks = [
@@ -360,18 +342,3 @@ def structure_checks(
         checks.append(Check(ENCODING, len(faults), 0, "fault", detail="".join(faults[:1])))
     checks.append(float_layers_check(int8))
     return [*checks, optimisation]
-
-
-def _odd_size(model: onnx.ModelProto) -> tuple[int, int, int, int]:
-    """Return the shape (N, C, H, W) of an image that the network accepts.
-
-    Free sides are 97 and 101 pixels, rounded up to multiples of the network's lattice. A fixed side
-    is as the file states it.
-    """
-    sizes = [side.dim_value for side in model.graph.input[0].type.tensor_type.shape.dim]
-    alignment_px = 1 if sizes[2] else tiling_of(model).alignment_px
-    rows, columns = (
-        fixed or -(-n // alignment_px) * alignment_px
-        for fixed, n in zip(sizes[2:], (97, 101), strict=True)
-    )
-    return 1, sizes[1] or 1, rows, columns

@@ -92,10 +92,17 @@ class LayerWriter:
             for name in (*op.inputs, op.output)
         ]
         shifts = "".join(f", {name} {value}" for name, value, _ in op_shifts(op, bits, SHIFTS))
+        kind = type(op).__name__
+        if isinstance(op, IntConv):
+            rows, columns = op.weight.shape[2:]
+            kind = f"{'transposed ' * op.transposed}convolution {rows} x {columns}"
+        activation = getattr(op, "activation", Activation.none)
+        if activation is not Activation.none:
+            kind = f"{kind}, {activation.name}"
         self.calls.append(f"/* Layer {number}, {plain(op.name)} */")
         self.constants.append(
             comment(
-                f"Layer {number}, {plain(op.name)}: {_summary(op)}{shifts}. "
+                f"Layer {number}, {plain(op.name)}: {kind}{shifts}. "
                 f"Reads {' and '.join(tensors[:-1])}, writes {tensors[-1]}."
             )
         )
@@ -206,16 +213,6 @@ def comment(*paragraphs: str) -> str:
     """
     lines = [fill(each, 97, initial_indent=" * ", subsequent_indent=" * ") for each in paragraphs]
     return "/*" + "\n".join(lines)[2:] + " */"
-
-
-def _summary(op: IntConv | Op) -> str:
-    """Return the kind of an operation, and its activation if it has one, as text for a comment."""
-    kind = type(op).__name__
-    if isinstance(op, IntConv):
-        rows, columns = op.weight.shape[2:]
-        kind = f"{'transposed ' * op.transposed}convolution {rows} x {columns}"
-    activation = getattr(op, "activation", Activation.none)
-    return f"{kind}, {activation.name}" if activation is not Activation.none else kind
 
 
 def _axes(window: Window, kernel: tuple[int, ...]) -> dict[str, str]:

@@ -39,10 +39,20 @@ def convolve(
         The sums, (N, O, H', W') int64.
     """
     if transposed:
-        wide, window = _between_zeros(image, weight, window)
+        # A transposed convolution is one of stride 1 over the pixels with zeros between them, its
+        # kernel turned.
+        rows, columns = window.strides
+        count, channels, height, width = image.shape
+        spread = (count, channels, (height - 1) * rows + 1, (width - 1) * columns + 1)
+        between = np.zeros(spread, image.dtype)
+        between[:, :, ::rows, ::columns] = image
+        image = between
+        # Its padding crops the result, so it takes off the full padding k - 1.
+        top, left, bottom, right = window.pads
+        tall, broad = (k - 1 for k in weight.shape[2:])
+        window = Window(pads=(tall - top, broad - left, tall - bottom, broad - right))
         weight = weight[:, :, ::-1, ::-1]
-    else:
-        wide = _padded(image, window)
+    wide = _padded(image, window)
     # An int8 value is at most 128 in size, so neither a sum nor a part of it exceeds this bound.
     # Below 2^24 float32 is exact in any order of summation, which the matrix product may choose.
     sizes = np.abs(weight.astype(np.int64)).sum((1, 2, 3))
@@ -63,25 +73,6 @@ def _windows(wide: np.ndarray, kernel: Sequence[int], window: Window) -> np.ndar
     tall, broad = window.dilations
     extent = (kernel[0] - 1) * tall + 1, (kernel[1] - 1) * broad + 1
     return sliding_window_view(wide, extent, (2, 3))[:, :, ::rows, ::columns, ::tall, ::broad]
-
-
-def _between_zeros(
-    image: np.ndarray, weight: np.ndarray, window: Window
-) -> tuple[np.ndarray, Window]:
-    """Return the pixels with zeros between them. A transposed convolution is one of stride 1 over
-    these, its kernel turned.
-    """
-    count, channels, height, width = image.shape
-    rows, columns = window.strides
-    top, left, bottom, right = window.pads
-    between = np.zeros(
-        (count, channels, (height - 1) * rows + 1, (width - 1) * columns + 1), image.dtype
-    )
-    between[:, :, ::rows, ::columns] = image
-    # A transposed convolution's padding crops its result, so it takes off the full padding k - 1.
-    tall, broad = (k - 1 for k in weight.shape[2:])
-    plain = Window(pads=(tall - top, broad - left, tall - bottom, broad - right))
-    return _padded(between, plain), plain
 
 
 def _products(windows: np.ndarray, weight: np.ndarray, groups: int) -> np.ndarray:

@@ -209,7 +209,14 @@ def read_samples(
     samples = list[Named]()
     for sample, image, reference in stored_samples(source, ranges or ()):
         pixels = _valid_image(sample, image, channels, ranges)
-        target = _valid_reference(sample, reference)
+        # Whether it must be an image in [0, 1] of the result's size depends on the measurement:
+        # `quant.gate.compare`.
+        if reference.dtype.kind not in "fuib":
+            raise ImageError(
+                f"The reference of {sample} must be of real numbers, got {reference.dtype}. "
+                f"{REMEDY}"
+            )
+        target = _finite(f"The reference of {sample}", reference)
         samples += [(sample, p) for p in _cut(pixels, target, sample, fixed_px, multiple_px)]
     if not samples:
         raise ImageError(f"{label} contains no sample, but at least one is needed. {REMEDY}")
@@ -247,18 +254,6 @@ def _finite(name: str, values: np.ndarray) -> np.ndarray:
             "pixels."
         )
     return finite
-
-
-def _valid_reference(name: str, reference: np.ndarray) -> np.ndarray:
-    """Return a reference as float32; raise ImageError if it is not made of real, finite numbers.
-
-    Whether it must be an image in [0, 1] of the result's size depends on the measurement:
-    `quant.gate.compare`.
-    """
-    name = f"The reference of {name}"
-    if reference.dtype.kind not in "fuib":
-        raise ImageError(f"{name} must be of real numbers, got {reference.dtype}. {REMEDY}")
-    return _finite(name, reference)
 
 
 def _valid_image(name: str, image: np.ndarray, channels: int, ranges: Ranges | None) -> np.ndarray:

@@ -115,32 +115,17 @@ def stored_samples(
             yield f"{IN_MEMORY}[{number}]", *pair
     elif source.is_dir():
         for file in sample_files(source):
-            yield file.name, _one_image(file, ranges), NO_REFERENCE
+            if file.suffix.lower() != ARRAY_SUFFIX:
+                image = from_shares(_bands_first(file, read_pixels(file)), ranges)
+            else:
+                image = _arrays(file, 3, "one image (C, H, W)")[0]
+            yield file.name, image, NO_REFERENCE
     else:
-        for number, pair in enumerate(_pairs(source)):
+        images, references = _arrays(source, 4, "a batch of (N, C, H, W)")
+        if references is NO_REFERENCE:
+            references = np.empty((len(images), 0), np.float32)
+        for number, pair in enumerate(_paired(str(source), images, references)):
             yield f"{source.name}[{number}]", *pair
-
-
-def _one_image(file: Path, ranges: Ranges) -> np.ndarray:
-    """Return the image (C, H, W) of an image file, or of a .npy file as the network reads it."""
-    if file.suffix.lower() != ARRAY_SUFFIX:
-        return from_shares(_bands_first(file, read_pixels(file)), ranges)
-    image, _ = _arrays(file)
-    if image.ndim != 3:
-        raise ImageError(f"{file} must be one image (C, H, W), got {format_shape(image)}. {REMEDY}")
-    return image
-
-
-def _pairs(path: Path) -> list[Pair]:
-    """Return the images (C, H, W) and references of the batch in one file."""
-    images, references = _arrays(path)
-    if images.ndim != 4:
-        raise ImageError(
-            f"{path} must be a batch of (N, C, H, W), got {format_shape(images)}. {REMEDY}"
-        )
-    if references is NO_REFERENCE:
-        references = np.empty((len(images), 0), np.float32)
-    return _paired(str(path), images, references)
 
 
 def _paired(label: str, images: np.ndarray, references: np.ndarray) -> list[Pair]:
@@ -153,11 +138,12 @@ def _paired(label: str, images: np.ndarray, references: np.ndarray) -> list[Pair
     return list(zip(images, references, strict=True))
 
 
-def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _arrays(path: Path, ndim: int, kind: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the memory-mapped array of a .npy file, or `image` and `reference` or the only array
     of a .npz file.
 
-    Nothing is unpickled.
+    Nothing is unpickled. An array with another number of dimensions raises ImageError, which calls
+    what was expected `kind`.
     """
     try:
         arrays = load_arrays(path)
@@ -173,6 +159,8 @@ def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise ImageError(
             f"{path} must have arrays named 'image' and 'reference', got {names}. {REMEDY}"
         )
+    if arrays[image].ndim != ndim:
+        raise ImageError(f"{path} must be {kind}, got {format_shape(arrays[image])}. {REMEDY}")
     return arrays[image], arrays.get("reference", NO_REFERENCE)
 
 

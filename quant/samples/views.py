@@ -141,7 +141,16 @@ def draw_views(
     # One generator draws all of this, so the order of the draws must not change: it determines the
     # result of a seed.
     indices = generator.choice(len(places), CANDIDATES * count, p=room / room.sum())
-    grounds = [_ground(places[k], recipe, generator) for k in indices]
+    # A Fourier transform wraps around; the margin keeps the far border out of the patch.
+    side_px = recipe.patch_px + 2 * MARGIN_PX
+    grounds = []
+    for k in indices:
+        scene, ratio = places[k]
+        top, left = (
+            int(generator.integers(size - side_px * ratio + 1)) for size in scene.radiance.shape
+        )
+        exposure = float(generator.uniform(*recipe.looks.exposures))
+        grounds.append(Ground(scene, top, left, side_px, ratio, exposure))
     source = recipe.family or recipe.degraded
     sensors = [source.draw(generator) for _ in range(CANDIDATES * count)]
     dark = recipe.degraded.radiance_0.low
@@ -208,19 +217,6 @@ def _places(scenes: Sequence[Scene], recipe: PatchRecipe) -> list[tuple[Scene, i
             "smaller patch."
         )
     return fitting
-
-
-def _ground(
-    place: tuple[Scene, int], recipe: PatchRecipe, generator: np.random.Generator
-) -> Ground:
-    scene, oversampling = place
-    # A Fourier transform wraps around; the margin keeps the far border out of the patch.
-    side_px = recipe.patch_px + 2 * MARGIN_PX
-    top, left = (
-        int(generator.integers(size - side_px * oversampling + 1)) for size in scene.radiance.shape
-    )
-    exposure = float(generator.uniform(*recipe.looks.exposures))
-    return Ground(scene, top, left, side_px, oversampling, exposure)
 
 
 def relit(

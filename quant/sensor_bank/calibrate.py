@@ -240,8 +240,22 @@ def quantize_behind_bank(
         The core for the sensor in the middle of the range, and the biases from which it is
         conditioned on any other sensor.
     """
-    body, _ = rounded(_plan(weights, shifts, passes, effort), images)
-    biases = {op.name: _biases(op) for op in body.convolutions}
+    graph = body_graph(weights)
+    scale = weights.variant.scale
+    width = len(channels()) * scale**2 + SENSOR_VALUES
+    host_part = HostPart(width, scale**2, adds_image=False, encoding=Direct(), decoding=DualRange())
+    inner = tuple(single_tensors(graph))
+    singles = SingleTensors(inner, (weights.variant.features,) * len(inner), by_channel=False)
+    groups = residual_groups(graph)
+    plan = Plan(graph, host_part, groups, singles, shifts, passes, effort)
+    body, _ = rounded(plan, images)
+    biases = {}
+    for op in body.convolutions:
+        biases[op.name] = op.float_bias[:, None]
+        if op.input == PLANES:
+            # The planes of the sensor's values hold half of each.
+            values = op.weight[:, -SENSOR_VALUES:, 1, 1] * 2.0 ** -(op.weight_frac_bits + 1)
+            biases[op.name] = np.concatenate([biases[op.name], values], 1)
     # A sensor's values are constant, so their planes become part of the biases.
     ops = tuple(
         replace(op, weight=op.weight[:, :-SENSOR_VALUES])
@@ -249,7 +263,7 @@ def quantize_behind_bank(
         else op
         for op in body.ops
     )
-    core = _assembled(replace(body, ops=ops), bank, weights.variant.scale, shifts, weights.kernels)
+    core = _assembled(replace(body, ops=ops), bank, scale, shifts, weights.kernels)
     conditioned = ConditionedCore(core, biases, shifts)
     return replace(conditioned, core=conditioned.for_sensor(bank, (0.0,) * SENSOR_VALUES))
 
@@ -288,26 +302,6 @@ def map_steps(conditioned: ConditionedCore, weights: Weights) -> list[np.ndarray
         steps(f"body.{k}.first", inputs, f"body.{k}.relu") for k in range(weights.variant.blocks)
     )
     return [group, *inner]
-
-
-def _biases(op: IntConv) -> np.ndarray:
-    """Return the bias (O, 1) of a convolution, and (O, 5) where it reads the sensor's values."""
-    if op.input != PLANES:
-        return op.float_bias[:, None]
-    # The planes of the sensor's values hold half of each.
-    values = op.weight[:, -SENSOR_VALUES:, 1, 1] * 2.0 ** -(op.weight_frac_bits + 1)
-    return np.concatenate([op.float_bias[:, None], values], 1)
-
-
-def _plan(weights: Weights, shifts: Shifts, passes: Passes, effort: Effort) -> Plan:
-    """Return the plan to quantise the body, which reads a bank's results."""
-    graph = body_graph(weights)
-    scale = weights.variant.scale
-    width = len(channels()) * scale**2 + SENSOR_VALUES
-    host_part = HostPart(width, scale**2, adds_image=False, encoding=Direct(), decoding=DualRange())
-    inner = tuple(single_tensors(graph))
-    singles = SingleTensors(inner, (weights.variant.features,) * len(inner), by_channel=False)
-    return Plan(graph, host_part, residual_groups(graph), singles, shifts, passes, effort)
 
 
 PATCHES = 80

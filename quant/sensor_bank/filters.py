@@ -132,7 +132,12 @@ def integer_bank(bank: Bank, scale: int, gain: float, kernels: Kernels = "fitted
     weights = list[NDArray[np.int64]]()
     # Each further copy of a kernel makes up for the rounding errors of those before it.
     for kernel, _ in channels(kernels):
-        weight = _of_filter(exact[kernel] + residual[kernel]) if kernel else _of_image(exact[0])
+        if kernel:
+            weight = _of_filter(exact[kernel] + residual[kernel])
+        else:
+            # The image comes in its own steps, and from the coarse planes only.
+            none = np.zeros(exact[0].shape, np.int64)
+            weight = np.stack([*_halves(np.rint(STEP_DN * exact[0]).astype(np.int64)), none, none])
         weights.append(weight)
         # The two coarse planes carry nearly all of a number; the others only the remainder.
         residual[kernel] += exact[kernel] - (weight[0] + weight[1]) / STEP_DN
@@ -142,13 +147,6 @@ def integer_bank(bank: Bank, scale: int, gain: float, kernels: Kernels = "fitted
     return IntegerBank(
         np.concatenate(planes, 1).astype(np.int8), frac_bits, np.repeat(offsets, scale**2)
     )
-
-
-def _of_image(kernel: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return weights (4, 7, 7) for the image in its own steps, from the coarse planes only."""
-    none = np.zeros(kernel.shape, np.int64)
-    coarse = np.rint(STEP_DN * kernel).astype(np.int64)
-    return np.stack([*_halves(coarse), none, none])
 
 
 def _halves(weight: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
