@@ -153,31 +153,29 @@ def load(recipe: DatasetRecipe, index: int) -> Scene:
 
 
 class Patch(NamedTuple):
-    """A pair of images (H, W) uint16, and its line of the manifest."""
+    """A pair of images (H, W) uint16, by role, and its line of the manifest."""
 
-    degraded: np.ndarray
-    reference: np.ndarray
+    images: dict[str, np.ndarray]
     line: Line
 
 
 def make_patches(recipe: DatasetRecipe, windows: list[Window]) -> list[Patch]:
     """Simulate the patches of the given windows, which must all lie in one scene."""
     radiance = load(recipe, windows[0].scene).radiance
-    return [_make_patch(recipe, window, radiance) for window in windows]
-
-
-def _make_patch(recipe: DatasetRecipe, window: Window, radiance: np.ndarray) -> Patch:
-    bottom = window.top + window.height
-    right = window.left + window.width
-    part = prepare_scene(radiance[window.top : bottom, window.left : right], recipe.oversampling)
-    draw = Draw(recipe.seed, window.number)
-    line, sensors = _drawn(recipe, window)
-    images = []
-    for role, sensor in sensors.items():
-        plan = make_plan(sensor, part.stats, recipe.tolerance_dn)
-        images.append(to_uint16(simulate_planned(part, sensor, draw, plan, role)))
-        line[role] = {**line[role], PLAN: plan.to_json()}
-    return Patch(images[0], images[1], line)
+    patches = []
+    for window in windows:
+        rows = slice(window.top, window.top + window.height)
+        columns = slice(window.left, window.left + window.width)
+        part = prepare_scene(radiance[rows, columns], recipe.oversampling)
+        draw = Draw(recipe.seed, window.number)
+        line, sensors = _drawn(recipe, window)
+        images = {}
+        for role, sensor in sensors.items():
+            plan = make_plan(sensor, part.stats, recipe.tolerance_dn)
+            images[role] = to_uint16(simulate_planned(part, sensor, draw, plan, role))
+            line[role][PLAN] = plan.to_json()
+        patches.append(Patch(images, line))
+    return patches
 
 
 PLAN = "plan"
@@ -265,7 +263,7 @@ def write_dataset(
             closing(_patches_by_path(recipe, waiting, workers, pool))
         ):
             for window, patch in zip(waiting[path], patches, strict=True):
-                for role, dn in (("degraded", patch.degraded), ("reference", patch.reference)):
+                for role, dn in patch.images.items():
                     write_tiff(image_of(out, role, window.name), dn)
                 lines[window.number] = line_text(out, patch.line)
             write_text(path, "".join(lines[window.number] for window in parts[path]))

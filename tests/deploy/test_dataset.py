@@ -75,7 +75,7 @@ def test_the_bytes_do_not_depend_on_the_workers(scene: Path, tmp_path: Path) -> 
 def test_any_patch_can_be_simulated_again_alone(scene: Path, dataset: Path) -> None:
     window = plan_windows(small(scene))[7]
     (patch,) = make_patches(small(scene), [window])
-    for role, dn in (("degraded", patch.degraded), ("reference", patch.reference)):
+    for role, dn in patch.images.items():
         np.testing.assert_array_equal(dn, tifffile.imread(dataset / role / f"{window.name}.tif"))
 
 
