@@ -249,7 +249,17 @@ class BankedConvBEERS(Layers):
                 they are not rounded.
         """
         filtered = each_by_its_own(image, condition.filters)
-        planes, analytic = self._clipped(filtered, condition.gains)
+        # Both are clipped to `Bank.reach`, which is where int8 ends, so that a network trains with
+        # what INT8 will show it.
+        planes = filtered[:, :FILTERS]
+        analytic = filtered[:, FILTERS:]
+        if self.kernels == "cut":
+            planes = planes.clamp(-LARGEST, LARGEST)
+            analytic = analytic.clamp(-LARGEST, LARGEST)
+        else:
+            reach = LARGEST / condition.gains[:, None, None, None]
+            planes = planes.clamp(-reach, reach)
+            analytic = analytic.clamp(-WIDE * reach, WIDE * reach)
         inputs = pixel_unshuffle(torch.cat([image - 0.5, planes], 1), self.variant.scale)
         shallow = (self.head(inputs) + self.bias(condition.vectors)[:, :, None, None]).contiguous(
             memory_format=torch.channels_last
@@ -257,18 +267,6 @@ class BankedConvBEERS(Layers):
         correction = self.corrected(shallow, bfloat16, steps)
         restored: Tensor = image + condition.units[:, None, None, None] * (analytic + correction)
         return restored
-
-    def _clipped(self, filtered: Tensor, gains: Tensor) -> tuple[Tensor, Tensor]:
-        """Clip planes and analytic restoration, (N, 5, H, W) in units, to the limits of
-        `Bank.reach`.
-        """
-        planes = filtered[:, :FILTERS]
-        analytic = filtered[:, FILTERS:]
-        if self.kernels == "cut":
-            return planes.clamp(-LARGEST, LARGEST), analytic.clamp(-LARGEST, LARGEST)
-        # Both end where int8 does, so that a network trains with what INT8 will show it.
-        reach = LARGEST / gains[:, None, None, None]
-        return planes.clamp(-reach, reach), analytic.clamp(-WIDE * reach, WIDE * reach)
 
 
 class OfOneSensor(nn.Module):

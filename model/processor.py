@@ -48,7 +48,17 @@ def int8_adds_exactly() -> bool:
     """Return True if onnxruntime adds products of uint8 and int8 without saturation;
     see `asked`.
     """
-    return asked("onnxruntime", _on_onnxruntime)
+
+    def convolve(model: bytes, image: "np.ndarray") -> "np.ndarray":
+        import numpy as np
+        import onnxruntime as ort
+
+        options = ort.SessionOptions()
+        options.intra_op_num_threads = 1
+        session = ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+        return np.asarray(session.run(None, {"image": image})[0])
+
+    return asked("onnxruntime", convolve)
 
 
 def asked(runtime: str, convolve: Convolve) -> bool:
@@ -64,16 +74,6 @@ def asked(runtime: str, convolve: Convolve) -> bool:
     words = "add exactly" if exact else "saturate; layers are computed in ways that do not"
     _decided[f"int8 on {runtime}"] = f"its kernels {words}"
     return exact
-
-
-def _on_onnxruntime(model: bytes, image: "np.ndarray") -> "np.ndarray":
-    import numpy as np
-    import onnxruntime as ort
-
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = 1
-    session = ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    return np.asarray(session.run(None, {"image": image})[0])
 
 
 def _largest_convolution() -> bytes:

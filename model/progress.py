@@ -83,15 +83,22 @@ def live_console() -> "Console | None":
 @contextmanager
 def _task(label: str, total: int | None) -> "Iterator[TaskID | None]":
     """Add a line to the bar while a block runs; None where no bar is drawn."""
-    if _sink.get() not in (None, True) or not _shows_bars():
+    if _sink.get() not in (None, True):
+        yield None
+        return
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    # A bar needs a terminal or a notebook to be drawn on.
+    if not console.is_terminal and not console.is_jupyter:
         yield None
         return
     # Two bars at once would overwrite each other.
     outer = Display.bar
-    bar = _new_bar() if outer is None else outer
-    if outer is None:
+    bar = outer
+    if bar is None:
+        bar = Display.bar = _new_bar()
         bar.start()
-        Display.bar = bar
     task = bar.add_task(one_line(label), total=total)
     try:
         yield task
@@ -103,27 +110,20 @@ def _task(label: str, total: int | None) -> "Iterator[TaskID | None]":
             bar.remove_task(task)
 
 
-def _shows_bars() -> bool:
-    """Return True if there is a terminal or a notebook to draw on."""
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    return console.is_terminal or console.is_jupyter
-
-
 def _new_bar() -> "Bar":
     from rich import progress as rich_progress
     from rich.console import Console
 
-    columns = (
+    return rich_progress.Progress(
         # Without markup a name in brackets is shown as it is.
         rich_progress.TextColumn("{task.description}", markup=False),
         rich_progress.BarColumn(),
         rich_progress.MofNCompleteColumn(),
         rich_progress.TimeElapsedColumn(),
         rich_progress.TimeRemainingColumn(),
+        console=Console(stderr=True),
+        transient=True,
     )
-    return rich_progress.Progress(*columns, console=Console(stderr=True), transient=True)
 
 
 class Steps:
@@ -151,15 +151,13 @@ class Steps:
             sink(Step(text, self.done, self.total))
         elif self._task is not None and Display.bar is not None:
             Display.bar.update(self._task, completed=self.done, description=one_line(text))
-        elif sink is not False and self._is_due():
-            self._printed = time.monotonic()
-            sys.stderr.write(f"{one_line(line.rstrip())}\n")
-
-    def _is_due(self) -> bool:
-        """Return True if a plain line is due: now and then, and at the end of outer work."""
-        if self.total is None or time.monotonic() - self._printed > LINE_EVERY_S:
-            return True
-        return self.done >= self.total and not self._nested
+        elif sink is not False:
+            # A plain line is due now and then, and at the end of outer work.
+            now = time.monotonic()
+            ends = self.total is None or (self.done >= self.total and not self._nested)
+            if ends or now - self._printed > LINE_EVERY_S:
+                self._printed = now
+                sys.stderr.write(f"{one_line(line.rstrip())}\n")
 
 
 _work: ContextVar[Steps | None] = ContextVar("work", default=None)
