@@ -32,7 +32,7 @@ from beers_deploy.model.family import RANGES, noise_over_full_scale
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.model.variants import Kernels
 from beers_deploy.profiles.instrument import Instrument
-from beers_deploy.profiles.response import NYQUIST
+from beers_deploy.profiles.response import NYQUIST, Array
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import REFERENCE
 
@@ -88,11 +88,11 @@ class Bank:
         sigma: standard deviation of the noise at a quarter of full scale, as a share of full scale.
     """
 
-    details: NDArray[np.float64]
+    details: Array
     sigma: float
 
     @cached_property
-    def units(self) -> NDArray[np.float64]:
+    def units(self) -> Array:
         """The share of full scale that is 1 in plane k, 20 sigma n_k, shape (4,)."""
         return np.asarray(UNIT * self.sigma * np.sqrt(np.square(self.details).sum((1, 2))))
 
@@ -119,24 +119,24 @@ class Bank:
         return LARGEST / self.gain, WIDE * LARGEST / self.gain
 
     @property
-    def planes(self) -> NDArray[np.float64]:
+    def planes(self) -> Array:
         """The kernels (4, 7, 7) that compute the planes u_k from shares of full scale."""
         return self.details / self.units[:, None, None]
 
     @property
-    def analytic(self) -> NDArray[np.float64]:
+    def analytic(self) -> Array:
         """D_1 + D_2 + D_3, shape (7, 7): the kernel that the analytic restoration adds to the
         image.
         """
         return np.asarray(self.details[1:].sum(0))
 
     @cached_property
-    def filters(self) -> NDArray[np.float64]:
+    def filters(self) -> Array:
         """The kernels (5, 7, 7) of the planes u_k and of the analytic part (W_1 - 1) x / g."""
         return np.concatenate([self.planes, self.analytic[None] / self.unit])
 
     @property
-    def kernels(self) -> NDArray[np.float64]:
+    def kernels(self) -> Array:
         """All kernels that a network applies to the image: the identity and `filters`, shape (6, 7,
         7).
         """
@@ -202,9 +202,7 @@ def _bank(sensor: Instrument, sigma: float, kernels: Kernels) -> Bank:
     return Bank(falling[:-1] - falling[1:], sigma)
 
 
-def fitted_kernel(
-    gain: NDArray[np.inexact], power: NDArray[np.float64], r_squared: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def fitted_kernel(gain: NDArray[np.inexact], power: Array, r_squared: Array) -> Array:
     """Compute the kernel (7, 7) of sum 1 with the least restoration error.
 
     It approximates a filter of any size that has the frequency response `gain`. For scenes whose
@@ -230,10 +228,10 @@ def fitted_kernel(
     equations[:-1, :-1] = correlation[rows[:, None] - rows, columns[:, None] - columns]
     equations[-1, -1] = 0
     solution = np.linalg.solve(equations, np.append(restoration[rows, columns], 1.0))
-    return np.asarray(solution[:-1].reshape(SIDE_PX, SIDE_PX))
+    return solution[:-1].reshape(SIDE_PX, SIDE_PX)
 
 
-def in_places(kernels: NDArray[np.float64], scale: int) -> NDArray[np.float64]:
+def in_places(kernels: Array, scale: int) -> Array:
     """Rewrite kernels (K, 7, 7) as a convolution on an image after pixel unshuffle by `scale`.
 
     S = `scale`, and any odd side is possible. Row i of a place reads row i + d of the same plane,
@@ -271,7 +269,7 @@ def restoring_gain(
     )
 
 
-def cut_filter(whole: NDArray[np.float64], radius_px: int, total: float) -> NDArray[np.float64]:
+def cut_filter(whole: Array, radius_px: int, total: float) -> Array:
     """Crop a filter to (2 R + 1, 2 R + 1), and correct its sum.
 
     A smooth window is added so that the sum becomes `total`. It changes only frequencies near 0,

@@ -85,7 +85,7 @@ def pupil_contrast(contrast: float, obscuration: float) -> Curve:
     frequency, contrasts = _pupil(obscuration)
     # It falls, but for rounding: read backwards it can be searched.
     at_nyquist = float(np.interp(contrast, contrasts[::-1], frequency[::-1]))
-    return np.asarray(np.interp(FREQUENCIES / NYQUIST * at_nyquist, frequency, contrasts))
+    return np.interp(FREQUENCIES / NYQUIST * at_nyquist, frequency, contrasts)
 
 
 @lru_cache

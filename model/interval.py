@@ -29,10 +29,8 @@ from beers_deploy.model.levels import LEVELS, Level
 from beers_deploy.model.simulator.mtf import mtf, sensor_mtf
 from beers_deploy.profiles.errors import ModelError, OptionError, printable, reason_of
 from beers_deploy.profiles.instrument import Instrument, noise_variances
-from beers_deploy.profiles.response import NYQUIST
+from beers_deploy.profiles.response import NYQUIST, Array
 from beers_deploy.profiles.toml import parse_json
-
-Array = NDArray[np.float64]
 
 CONTEXT_PX = 1
 """Rows and columns around a pixel that its half-width depends on."""
@@ -297,4 +295,4 @@ def _window_sums(values: Array) -> Array:
     """Return the sums over windows of 3 x 3 pixels, (h, w); beyond the array all is 0."""
     padded = np.pad(values, CONTEXT_PX)
     columns = padded[:-2] + padded[1:-1] + padded[2:]
-    return np.asarray(columns[:, :-2] + columns[:, 1:-1] + columns[:, 2:])
+    return columns[:, :-2] + columns[:, 1:-1] + columns[:, 2:]

@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beers_deploy.model.interval import (
-    Array,
     Conditions,
     Exponents,
     PixelInterval,
@@ -32,6 +31,7 @@ from beers_deploy.model.interval import (
 from beers_deploy.model.levels import LEVELS
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.instrument import Instrument, noise_variances
+from beers_deploy.profiles.response import Array
 
 LEAST_ERROR = 0.02
 """The least |error| / sigma in the fit, where the logarithm of 0 would not be finite."""
@@ -107,7 +107,7 @@ class Sample:
         scores is the factor that scales half-widths to a level.
         """
         half = exponents.half_widths(self.conditions, self.noise, self.detail)
-        return np.asarray(self.error / half)
+        return self.error / half
 
 
 def calibrated(fitted: Sequence[Sample], held_out: Sequence[Sample]) -> PixelInterval:

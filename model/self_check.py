@@ -40,8 +40,7 @@ from scipy.ndimage import distance_transform_edt, maximum_filter
 from beers_deploy.model.consistency.blocks import Image, Placed
 from beers_deploy.model.consistency.step import blur_between, centre
 from beers_deploy.profiles.instrument import Instrument, noise_variances
-
-Array = NDArray[np.float64]
+from beers_deploy.profiles.response import Array
 
 BLOCK_PX = 64
 """Side of a block: chi2 of its 256 cells of pure noise scatters by 9 %."""
@@ -110,12 +109,12 @@ class Judged:
     @property
     def outside(self) -> NDArray[np.bool_]:
         """Return True for each block whose residual is more than noise."""
-        return np.asarray(self.chi2 > MOST_CHI2 + MOST_PER_SHARPENING * self.sharpening)
+        return self.chi2 > MOST_CHI2 + MOST_PER_SHARPENING * self.sharpening
 
     @property
     def decidable(self) -> NDArray[np.bool_]:
         """Return True for each block that would show a wrong restoration, or shows one."""
-        return np.asarray((self.sharpening >= LEAST_SHARPENING) | self.outside)
+        return (self.sharpening >= LEAST_SHARPENING) | self.outside
 
 
 @dataclass(frozen=True)
@@ -249,4 +248,4 @@ def _sums(values: NDArray[np.generic], side: int) -> Array:
     """
     down, across = (np.arange(0, length, side) for length in values.shape)
     sums = np.add.reduceat(values, down, axis=0, dtype=np.float64)
-    return np.asarray(np.add.reduceat(sums, across, axis=1))
+    return np.add.reduceat(sums, across, axis=1)

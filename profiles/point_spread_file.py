@@ -4,13 +4,13 @@ import math
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 
 from beers_deploy.profiles.arrays import ALONE, load_arrays
 from beers_deploy.profiles.errors import ProfileError, printable
 from beers_deploy.profiles.response import (
     KEPT_SIDE,
+    Array,
     PointSpread,
     SamplesPerPx,
     centroid,
@@ -96,7 +96,7 @@ class PointSpreadFile:
         return validated(PointSpread, fields, where)
 
 
-def _normalised(where: str, samples: NDArray[np.float64]) -> NDArray[np.float64]:
+def _normalised(where: str, samples: Array) -> Array:
     """Scale the samples to a sum of 1, or raise ProfileError if that is not possible."""
     finite = bool(np.isfinite(samples).all())
     # The largest is brought to 1 first, because the sum of finite samples may overflow.
@@ -111,7 +111,7 @@ def _normalised(where: str, samples: NDArray[np.float64]) -> NDArray[np.float64]
     return samples / total
 
 
-def _read_samples(where: str, path: Path) -> NDArray[np.float64]:
+def _read_samples(where: str, path: Path) -> Array:
     """Read the samples (H, W) of a .npy file, or raise ProfileError."""
     try:
         # Mapped: nothing is read before its shape is known.

@@ -31,6 +31,7 @@ from beers_deploy.profiles.validation import CONFIG
 
 NYQUIST = 0.5
 """The Nyquist frequency in cycles per pixel."""
+Array = NDArray[np.float64]
 Frequencies = NDArray[np.floating]
 
 
@@ -143,7 +144,7 @@ class MtfTable:
         """Contrast at 0.5 cycles per pixel, across and along the track."""
         return _contrast_at_nyquist(self)
 
-    def at(self, fx: Frequencies, fy: Frequencies) -> NDArray[np.float64]:
+    def at(self, fx: Frequencies, fy: Frequencies) -> Array:
         """Return the MTF (H, W) at the frequencies fx (1, W) and fy (H, 1).
 
         The MTF of the square detector is divided out. The logarithm of the rest is interpolated
@@ -155,7 +156,7 @@ class MtfTable:
         radius = np.hypot(fx, fy)
         gamma_x, gamma_y = self.gammas(radius)
         optics = np.exp(-np.hypot(gamma_x * fx, gamma_y * fy))
-        return np.asarray(optics * np.sinc(fx) * np.sinc(fy))
+        return optics * np.sinc(fx) * np.sinc(fy)
 
     def gammas(self, radius: Frequencies) -> list[Frequencies]:
         """Return the gamma of each axis, across and along the track, at radii of any shape."""
@@ -249,7 +250,7 @@ def packed(values: NDArray[np.floating]) -> str:
     return base64.b64encode(zlib.compress(content, 9)).decode()
 
 
-def unpacked(point: PointSpread) -> NDArray[np.float64]:
+def unpacked(point: PointSpread) -> Array:
     """Decode the samples of a point-spread function, (height, width).
 
     Raises:
@@ -265,7 +266,7 @@ def unpacked(point: PointSpread) -> NDArray[np.float64]:
     return np.frombuffer(content, "<f4").astype(np.float64).reshape(point.height, point.width)
 
 
-def centroid(values: NDArray[np.float64]) -> tuple[float, float]:
+def centroid(values: Array) -> tuple[float, float]:
     """Return the row and column of the centroid of samples (H, W), in samples and relative to the
     middle.
 
@@ -277,7 +278,7 @@ def centroid(values: NDArray[np.float64]) -> tuple[float, float]:
 
 
 @lru_cache(maxsize=8)
-def _grid(point: PointSpread) -> tuple[NDArray[np.float64], ...]:
+def _grid(point: PointSpread) -> tuple[Array, ...]:
     """Return the samples scaled to a sum of 1, and the positions of their rows and columns.
 
     Positions are relative to the centroid, in target pixels.

@@ -116,7 +116,7 @@ class IntConv(OneInput):
     @property
     def float_bias(self) -> np.ndarray:
         """The real values (O,) float64 that the integer bias represents."""
-        return np.asarray(self.bias * 2.0**-self.bias_frac_bits)
+        return self.bias * 2.0**-self.bias_frac_bits
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ Only the near part of H is needed, because G_2 - G_8 removes what varies slowly.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from beers_deploy.model.consistency.blocks import (
     BLOCK_PX,
@@ -29,6 +28,7 @@ from beers_deploy.model.consistency.blocks import (
     interpolate,
     weighted_sums,
 )
+from beers_deploy.profiles.response import Array
 
 FINE_PX = 2
 """Side of a fine block.
@@ -52,7 +52,7 @@ class DetailStep:
     columns: Image
 
     @classmethod
-    def of(cls, rows: NDArray[np.float64], columns: NDArray[np.float64]) -> "DetailStep":
+    def of(cls, rows: Array, columns: Array) -> "DetailStep":
         """Build the step from the separable filters (terms, 2 NEAR_PX + 1) of H's near part."""
         return cls(window_weights(rows, FINE_PX), window_weights(columns, FINE_PX))
 
@@ -73,10 +73,10 @@ class DetailStep:
         )
         means = block_means(residual, BLOCK_PX // FINE_PX)
         change = interpolate(residual, down, across, FINE_PX) - interpolate(means, down, across)
-        return np.asarray(change * down.inside[:, None] * across.inside)
+        return change * down.inside[:, None] * across.inside
 
 
-def window_weights(vectors: NDArray[np.float64], block_px: int) -> Image:
+def window_weights(vectors: Array, block_px: int) -> Image:
     """Return the weights with which pixels enter the mean of a block after convolution.
 
     Args:

@@ -101,7 +101,7 @@ class Smoothing:
         """Return n for pixel values of any shape."""
         dark, growth, square = map(np.float32, self.variances)
         light = np.maximum(pixels - np.float32(self.offset), np.float32(0))
-        return np.asarray(np.maximum(dark + growth * light + square * light**2, np.float32(0)))
+        return np.maximum(dark + growth * light + square * light**2, np.float32(0))
 
 
 def _means(values: Image) -> NDArray[np.float32]:

@@ -56,6 +56,7 @@ from beers_deploy.model.consistency.smooth import SMOOTH_PX, Smoothing
 from beers_deploy.model.departure import has_other_curve
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.response import Array
 
 NEAR_PX = 8
 """Radius of the near part of H.
@@ -274,20 +275,20 @@ class Consistency:
         return total
 
 
-def blur_between(sensor: Instrument, reference: Instrument) -> NDArray[np.float64]:
+def blur_between(sensor: Instrument, reference: Instrument) -> Array:
     """Compute the filter H, centred on its first pixel, (GRID, GRID) float64 of sum 1."""
     fy = np.fft.fftfreq(GRID)[:, None]
     fx = np.fft.fftfreq(GRID)[None, :]
     ratio = sensor_mtf(fx, fy, sensor) / sensor_mtf(fx, fy, reference)
-    return np.asarray(np.fft.ifft2(ratio / ratio[0, 0]).real)
+    return np.fft.ifft2(ratio / ratio[0, 0]).real
 
 
-def centre(kernel: NDArray[np.float64], radius: int) -> NDArray[np.float64]:
+def centre(kernel: Array, radius: int) -> Array:
     """Cut a filter that is centred on its first element to (2 R + 1, 2 R + 1)."""
     return np.roll(kernel, (radius, radius), (0, 1))[: 2 * radius + 1, : 2 * radius + 1]
 
 
-def _far_weights(kernel: NDArray[np.float64], near: NDArray[np.float64]) -> NDArray[np.float64]:
+def _far_weights(kernel: Array, near: Array) -> Array:
     """Compute the weights of the surrounding block means in the mean of H x, without the near part.
 
     A filter f is applied to a block of constant value, d blocks away. The mean of the result over

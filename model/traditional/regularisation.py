@@ -33,7 +33,7 @@ from beers_deploy.model.simulator.detector import to_radiance
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.model.traditional.noise import with_rounding_noise
 from beers_deploy.profiles.instrument import Instrument
-from beers_deploy.profiles.response import NYQUIST
+from beers_deploy.profiles.response import NYQUIST, Array
 
 SCALE = 0.55
 POWER = 1.12
@@ -70,7 +70,6 @@ With 8 and 16 px the mean loss to the best epsilon is 0.001 and 0.003 dB larger.
 GRID = 64
 """Frequencies along an axis in the mean of the spectrum."""
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 

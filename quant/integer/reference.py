@@ -218,7 +218,7 @@ def _moving(core: IntCore, op: Op, inputs: list[np.ndarray]) -> np.ndarray:
     if isinstance(op, Resize):
         return inputs[0].repeat(op.factor, axis=2).repeat(op.factor, axis=3)
     if isinstance(op, Shuffle):
-        return np.asarray(op(inputs[0]))
+        return op(inputs[0])
     assert isinstance(op, Pointwise)  # noqa: S101
     # 256 values can enter, so the function is a table; its first entry is that of -128.
     table: np.ndarray = activation_table(op, core.frac_bits)

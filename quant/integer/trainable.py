@@ -209,7 +209,7 @@ class TrainableCore(torch.nn.Module):
 
 def _whole(values: Tensor) -> np.ndarray:
     """Return parameters as the int8 integers that they round to."""
-    return np.asarray(to_int8(values.detach()).numpy().astype(np.int8))
+    return to_int8(values.detach()).numpy().astype(np.int8)
 
 
 def _products(op: IntConv, image: Tensor, weight: Tensor, bias: Tensor) -> Tensor:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from beers_deploy.model.bank import FILTERS, SIDE_PX, UNIT_STEPS, WIDE, Bank, in_places
 from beers_deploy.model.variants import Kernels
 from beers_deploy.profiles.instrument import MAX_DN
+from beers_deploy.profiles.response import Array
 from beers_deploy.quant.host_part import BANK_SLICES
 
 STEP_DN = BANK_SLICES.step
@@ -67,7 +68,7 @@ class IntegerBank:
 
     weight: NDArray[np.int8]
     frac_bits: int
-    offsets: NDArray[np.float64]
+    offsets: Array
 
 
 def coarse_copies(kernels: Kernels) -> int:
@@ -155,7 +156,7 @@ def _halves(weight: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.in
     return weight // 2, weight - weight // 2
 
 
-def _of_filter(kernel: NDArray[np.float64]) -> NDArray[np.int64]:
+def _of_filter(kernel: Array) -> NDArray[np.int64]:
     """Return weights (4, 7, 7) for a kernel (7, 7) of sum 0 that multiplies digital numbers."""
     coarse = shaped(STEP_DN * kernel.ravel())
     # The last plane holds half of the remainder, so this grid is twice as fine.
@@ -170,7 +171,7 @@ def _of_filter(kernel: NDArray[np.float64]) -> NDArray[np.int64]:
     return weight.reshape(BANK_SLICES.planes, *kernel.shape)
 
 
-def shaped(values: NDArray[np.float64]) -> NDArray[np.int64]:
+def shaped(values: Array) -> NDArray[np.int64]:
     """Round the weights of a filter to integers of sum 0, with errors that natural images hardly
     show.
 
@@ -197,19 +198,19 @@ def shaped(values: NDArray[np.float64]) -> NDArray[np.int64]:
         np.fill_diagonal(change, 0)
         up, down = np.unravel_index(np.argmin(change), change.shape)
         if change[up, down] >= 0:
-            return np.asarray(weight.astype(np.int64))
+            return weight.astype(np.int64)
         weight[up] += 1
         weight[down] -= 1
         slope += COVARIANCE[up] - COVARIANCE[down]
 
 
-def _covariance() -> NDArray[np.float64]:
+def _covariance() -> Array:
     places = np.indices((SIDE_PX, SIDE_PX)).reshape(2, -1).T
     distance = np.linalg.norm(places[:, None] - places[None, :], axis=-1)
     return _on_grid(np.exp(-distance / REACH_PX))
 
 
-def _on_grid(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _on_grid(values: Array) -> Array:
     """Round to so few bits that sums of 49 products are exact in float64, in any order."""
     return np.asarray(np.rint(np.ldexp(values, GRID_BITS)) / 2**GRID_BITS)
 
