@@ -26,7 +26,7 @@ network loses less in INT8.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -176,8 +176,7 @@ class ConvBEERS(Layers):
         )
 
 
-@dataclass(frozen=True)
-class Condition:
+class Condition(NamedTuple):
     """The description of the sensors of N images on which a network behind a bank is conditioned,
     float32.
 
@@ -201,22 +200,17 @@ class Condition:
         gains = vectors.new_tensor([bank.gain for bank in banks])
         return cls(vectors, filters, units, gains)
 
-    @property
-    def parts(self) -> tuple[Tensor, ...]:
-        """All tensors, in the order of the attributes."""
-        return self.vectors, self.filters, self.units, self.gains
-
     def to(self, device: torch.device) -> "Condition":
         """Return the same description on a device."""
-        return Condition(*(part.to(device, non_blocking=True) for part in self.parts))
+        return Condition(*(part.to(device, non_blocking=True) for part in self))
 
     def repeated(self, count: int) -> "Condition":
         """Repeat the description of one image `count` times."""
-        return Condition(*(part.expand(count, *part.shape[1:]) for part in self.parts))
+        return Condition(*(part.expand(count, *part.shape[1:]) for part in self))
 
     def some(self, which: slice | Tensor) -> "Condition":
         """Return the descriptions of the images that `which` selects."""
-        return Condition(*(part[which] for part in self.parts))
+        return Condition(*(part[which] for part in self))
 
 
 class BankedConvBEERS(Layers):

@@ -144,8 +144,9 @@ class PatchSource:
         patches = torch.cat([item.patches for item in visits])
         patches = patches[places.to(patches.device)]
         condition = None
-        if parts := [item.condition.parts for item in visits if item.condition is not None]:
-            condition = Condition(*(torch.cat(part)[places] for part in zip(*parts, strict=True)))
+        if conditions := [item.condition for item in visits if item.condition is not None]:
+            parts = zip(*conditions, strict=True)
+            condition = Condition(*(torch.cat(part)[places] for part in parts))
         return Batch(patches[:, :1].contiguous(), patches[:, 1:].contiguous(), condition)
 
 

@@ -45,15 +45,8 @@ class Inputs:
 
     def tensors(self) -> list[Tensor]:
         """Return all tensors in a fixed order."""
-        condition = () if self.batch.condition is None else self.batch.condition.parts
-        return [
-            self.batch.degraded,
-            self.batch.reference,
-            *condition,
-            *self.steps,
-            self.rate,
-            self.share,
-        ]
+        degraded, reference, condition = self.batch
+        return [degraded, reference, *(condition or ()), *self.steps, self.rate, self.share]
 
 
 class Step:

@@ -38,7 +38,7 @@ def test_the_same_seed_gives_the_same_batches_from_anywhere() -> None:
 
 
 def parts(batch: Batch) -> list[torch.Tensor]:
-    return [batch.degraded, batch.reference, *(batch.condition.parts if batch.condition else ())]
+    return [batch.degraded, batch.reference, *(batch.condition or ())]
 
 
 def equal(one: Batch, other: Batch) -> bool:
