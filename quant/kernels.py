@@ -207,8 +207,22 @@ def _add_exactly(largest: dict[str, int], graph: OnnxGraph, node: Node) -> list[
         return None
     _lift(graph, node, places.weight, places.weight_zero)
     zero = graph.value(node, places.zero)
-    is_signed = zero is not None and zero.dtype == np.int8
-    return _converted(graph, node, places) if is_signed else None
+    if zero is None or zero.dtype != np.int8:
+        return None
+    # Signed activations are converted to uint8 before the node, and its result back behind it.
+    _lift(graph, node, places.zero)
+    source = f"{node.inputs[0]}.unsigned"
+    nodes = [node]
+    # The activations are converted once for all their readers.
+    if source not in graph.writers:
+        nodes = [*_moved(graph, node.inputs[0], MIDDLE, TensorProto.UINT8, source), node]
+    _set_input(node, 0, source)
+    if places.result_zero is not None:
+        _lift(graph, node, places.result_zero)
+        result = node.outputs[0]
+        node.outputs = (f"{result}.unsigned",)
+        nodes += _moved(graph, node.outputs[0], -MIDDLE, TensorProto.INT8, result)
+    return nodes
 
 
 def _add_dequantised(graph: OnnxGraph, node: Node) -> list[Node] | None:
@@ -243,25 +257,6 @@ def _lift(graph: OnnxGraph, node: Node, *places: int) -> None:
         # The sum is formed in int16, because int8 wraps around above 127.
         lifted = (value.astype(np.int16) + MIDDLE).astype(np.uint8)
         _set_input(node, place, _constant(graph, lifted))
-
-
-def _converted(graph: OnnxGraph, node: Node, places: Places) -> list[Node]:
-    """Return the node on uint8 activations, between the nodes that convert these and its
-    result.
-    """
-    _lift(graph, node, places.zero)
-    source = f"{node.inputs[0]}.unsigned"
-    nodes = [node]
-    # The activations are converted once for all their readers.
-    if source not in graph.writers:
-        nodes = [*_moved(graph, node.inputs[0], MIDDLE, TensorProto.UINT8, source), node]
-    _set_input(node, 0, source)
-    if places.result_zero is not None:
-        _lift(graph, node, places.result_zero)
-        result = node.outputs[0]
-        node.outputs = (f"{result}.unsigned",)
-        nodes += _moved(graph, node.outputs[0], -MIDDLE, TensorProto.INT8, result)
-    return nodes
 
 
 def _moved(graph: OnnxGraph, source: str, by: int, kind: int, result: str) -> list[Node]:

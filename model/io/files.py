@@ -64,9 +64,18 @@ def require_writable(
     for folder in image_folders:
         if os.path.lexists(folder) and not folder.is_dir():
             raise MachineError(f"{folder} is not a folder. Choose another path.")
-    for path in outputs:
-        require_regular(path)
-        _probe(path)
+    for output in outputs:
+        require_regular(output)
+        # Written in the nearest existing folder: a new one would remain if the command fails later.
+        path = output.absolute()
+        folder = next(parent for parent in path.parents if os.path.lexists(parent))
+        try:
+            with TemporaryDirectory(dir=folder) as probe:
+                place = probe / path.relative_to(folder)
+                place.parent.mkdir(parents=True, exist_ok=True)
+                _part_of(place).touch()
+        except OSError as error:
+            raise _unwritable(path, error.strerror or str(error)) from error
 
 
 def _require_apart(
@@ -106,21 +115,6 @@ def require_regular(path: Path) -> None:
             f"{path} {kind}, but an output must be a regular file or a new name. Choose another "
             "path."
         )
-
-
-def _probe(path: Path) -> None:
-    """Try to write in the nearest existing folder: a new one would remain if the command fails
-    later.
-    """
-    path = path.absolute()
-    folder = next(parent for parent in path.parents if os.path.lexists(parent))
-    try:
-        with TemporaryDirectory(dir=folder) as probe:
-            place = probe / path.relative_to(folder)
-            place.parent.mkdir(parents=True, exist_ok=True)
-            _part_of(place).touch()
-    except OSError as error:
-        raise _unwritable(path, error.strerror or str(error)) from error
 
 
 def _part_of(path: Path) -> Path:

@@ -129,17 +129,12 @@ def grid(names: list[str], rows: list[list[np.ndarray]], zoom: int) -> Image.Ima
     draw = ImageDraw.Draw(canvas)
     for column, name in enumerate(names):
         left = column * (width + GAP_PX)
-        draw.text((left + 2, 1), name, fill="black", font=_font_for(name, width))
+        # The largest font in which the name fits into its column.
+        fonts = (ImageFont.load_default(size=size) for size in range(LABEL_PX - 6, 7, -1))
+        fitting = (font for font in fonts if font.getlength(name) <= width - 2)
+        font = next(fitting, ImageFont.load_default(size=8))
+        draw.text((left + 2, 1), name, fill="black", font=font)
         for number, row in enumerate(rows):
             cell = Image.fromarray(row[column]).resize((width, height), Image.Resampling.NEAREST)
             canvas.paste(cell, (left, LABEL_PX + number * (height + GAP_PX)))
     return canvas
-
-
-def _font_for(name: str, width_px: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Return the largest font in which a name fits into its column."""
-    for size in range(LABEL_PX - 6, 7, -1):
-        font = ImageFont.load_default(size=size)
-        if font.getlength(name) <= width_px - 2:
-            return font
-    return ImageFont.load_default(size=8)

@@ -262,6 +262,8 @@ def _read(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
 
 PUBLISHED = Path(__file__).parent / "weights"
 MIN_NORM = 1e-3
+SMALL = 1e-6
+"""The constant c of DISTS, which keeps its quotients finite."""
 
 
 class Lpips(nn.Module):
@@ -343,9 +345,23 @@ class Dists(nn.Module):
         _check_pair(self.label, self.backbone, image, reference)
         with torch.autocast(image.device.type, enabled=False):
             stages = zip(self.backbone(image), self.backbone(reference), strict=True)
-            terms = [_texture_and_structure(a, b) for a, b in stages]
-            texture, structure = (torch.cat(parts, dim=1) for parts in zip(*terms, strict=True))
-            return texture @ self.alpha + structure @ self.beta
+            textures = []
+            structures = []
+            # 1 minus the similarity of the means, and of the covariances, of each channel. Both are
+            # computed from differences and not as 1 - (2 x y + c) / (x^2 + y^2 + c), so that
+            # identical images give exactly 0.
+            for a, b in stages:
+                mean_a = a.mean(dim=(2, 3), keepdim=True)
+                mean_b = b.mean(dim=(2, 3), keepdim=True)
+                a = a - mean_a
+                b = b - mean_b
+                squares = mean_a.square() + mean_b.square()
+                textures.append(((mean_a - mean_b).square() / (squares + SMALL)).flatten(1))
+                variances = a.square().mean(dim=(2, 3)) + b.square().mean(dim=(2, 3))
+                structures.append((a - b).square().mean(dim=(2, 3)) / (variances + SMALL))
+            return (
+                torch.cat(textures, dim=1) @ self.alpha + torch.cat(structures, dim=1) @ self.beta
+            )
 
 
 def _unit(features: Tensor) -> Tensor:
@@ -356,24 +372,6 @@ def _unit(features: Tensor) -> Tensor:
     most 1 / MIN_NORM.
     """
     return features / features.square().sum(dim=1, keepdim=True).clamp(min=MIN_NORM**2).sqrt()
-
-
-def _texture_and_structure(a: Tensor, b: Tensor, small: float = 1e-6) -> tuple[Tensor, Tensor]:
-    """Compute 1 minus the similarity of the means, and of the covariances, of each channel.
-
-    Both are computed from differences and not as 1 - (2 x y + c) / (x^2 + y^2 + c), so that
-    identical images give exactly 0.
-
-    Returns:
-        Two tensors (N, C).
-    """
-    mean_a = a.mean(dim=(2, 3), keepdim=True)
-    mean_b = b.mean(dim=(2, 3), keepdim=True)
-    a = a - mean_a
-    b = b - mean_b
-    texture = (mean_a - mean_b).square() / (mean_a.square() + mean_b.square() + small)
-    variances = a.square().mean(dim=(2, 3)) + b.square().mean(dim=(2, 3))
-    return texture.flatten(1), (a - b).square().mean(dim=(2, 3)) / (variances + small)
 
 
 def _check_pair(label: str, backbone: Backbone, image: Tensor, reference: Tensor) -> None:

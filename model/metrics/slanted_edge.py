@@ -138,7 +138,7 @@ class Plateaus:
         """
         frequencies = np.asarray(frequencies)
         gaussian = np.exp(-2 * (math.pi * softness_px * frequencies) ** 2)
-        return np.asarray(np.exp(-2 * math.pi * self.tail_px * frequencies) * gaussian)
+        return np.exp(-2 * math.pi * self.tail_px * frequencies) * gaussian
 
     def model(self, distance: np.ndarray, softness_px: float) -> np.ndarray:
         """Return the pixel values (N,) of an edge with these sides and tails and a Gaussian blur.
@@ -196,23 +196,17 @@ def _mtf(image: np.ndarray, distance: np.ndarray, plateaus: Plateaus) -> float:
     position = np.arange(residual.size) + shift
     slope = np.gradient(residual, position)
     at_centres = residual - shift * slope + shift**2 / 2 * np.gradient(slope, position)
-    correction = _transform(variance_px2) @ at_centres / plateaus.step
-    return float(plateaus.transfer(NYQUIST, softness_px) + correction)
-
-
-def _transform(variance_px2: float) -> np.ndarray:
-    """Compute the weight (B,) of each bin in the transform at Nyquist.
-
-    It combines derivative, window and cosine, and compensates their losses. `variance_px2` is the
-    variance of the positions of the pixels within a bin, which adds blur by averaging.
-    """
-    place = np.arange(-HALF + 1, HALF) / BINS_PER_PX
-    wave = np.cos(2 * math.pi * NYQUIST * place) * _hamming(place)
-    # The derivative as a central difference, turned onto the weights so that it costs no pass of
-    # its own.
+    # The weight of each bin in the transform at Nyquist: derivative, window and cosine. The
+    # derivative is a central difference, turned onto the weights so that it costs no pass of its
+    # own.
+    distances = np.arange(-HALF + 1, HALF) / BINS_PER_PX
+    wave = np.cos(2 * math.pi * NYQUIST * distances) * _hamming(distances)
     weights = (np.pad(wave, (2, 0)) - np.pad(wave, (0, 2))) / 2
+    # The difference blurs, and so does averaging over the positions of the pixels within a bin.
     averaging = math.exp(-2 * (math.pi * NYQUIST) ** 2 * variance_px2)
-    return np.asarray(weights / (averaging * np.sinc(2 * NYQUIST / BINS_PER_PX)))
+    weights /= averaging * np.sinc(2 * NYQUIST / BINS_PER_PX)
+    correction = weights @ at_centres / plateaus.step
+    return float(plateaus.transfer(NYQUIST, softness_px) + correction)
 
 
 def slanted_edge(

@@ -150,7 +150,24 @@ def estimate_groups(
     variance = covariance.diagonal(dim1=1, dim2=2).mean(1) + mean[:, 0].var(1, correction=0)
     flat = variance < (0.0 if settings.clean_guide else FLAT_GAMMA * noise.sigma**2)
     shrinkage = torch.zeros_like(covariance)
-    shrinkage[~flat] = _shrinkage(covariance[~flat], noise, settings)
+    # The matrix beta S^-1 Sigma, for patches as rows, or 0 where S has no Cholesky factor.
+    covariance = covariance[~flat]
+    sigma_matrix = noise.covariance(settings.side_px).to(covariance) * settings.excess
+    diagonal = covariance.diagonal(dim1=1, dim2=2)
+    # A drawn or saturated area has rank 0 or 1: the covariance is then no better known than its own
+    # rounding.
+    diagonal.add_(torch.finfo(covariance.dtype).eps * diagonal.sum(1, keepdim=True))
+    if settings.clean_guide:
+        covariance = covariance + sigma_matrix
+    else:
+        diagonal.add_(JITTER * noise.sigma**2)
+    factor, failed = torch.linalg.cholesky_ex(covariance)
+    no_factor = failed != 0
+    # Any factor does there, since its result is thrown away: the batch has to stay one call.
+    factor[no_factor] = torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device)
+    solved = torch.cholesky_inverse(factor) @ sigma_matrix
+    solved[no_factor] = 0
+    shrinkage[~flat] = solved
     estimates = torch.baddbmm(noisy, centred, shrinkage, alpha=-1)
     # The plain mean knows that the signal is one number; the Gaussian model would have to find that
     # out.
@@ -172,25 +189,3 @@ def _moments(patches: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tens
     mean = share[:, None] @ patches
     centred = patches - mean
     return mean, centred, centred.mT @ (centred * share[..., None])
-
-
-def _shrinkage(covariance: Tensor, noise: Noise, settings: PassSettings) -> Tensor:
-    """Compute the matrix beta S^-1 Sigma, for patches as rows, or 0 where S has no
-    Cholesky factor.
-    """
-    sigma_matrix = noise.covariance(settings.side_px).to(covariance) * settings.excess
-    diagonal = covariance.diagonal(dim1=1, dim2=2)
-    # A drawn or saturated area has rank 0 or 1: the covariance is then no better known than its own
-    # rounding.
-    diagonal.add_(torch.finfo(covariance.dtype).eps * diagonal.sum(1, keepdim=True))
-    if settings.clean_guide:
-        covariance = covariance + sigma_matrix
-    else:
-        diagonal.add_(JITTER * noise.sigma**2)
-    factor, failed = torch.linalg.cholesky_ex(covariance)
-    no_factor = failed != 0
-    # Any factor does there, since its result is thrown away: the batch has to stay one call.
-    factor[no_factor] = torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device)
-    shrinkage = torch.cholesky_inverse(factor) @ sigma_matrix
-    shrinkage[no_factor] = 0
-    return shrinkage

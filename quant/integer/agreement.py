@@ -109,14 +109,27 @@ def integer_rows(
     layers = [_layer_row(list(same), source) for same in by_layer]
     session = open_any_size(model)
     part = core.host_part
-    results = [
-        [to_shares(part.finish(crop, x), part.input_ranges) for x in (one.up, one.even)]
-        for crop, one in zip(patches, agreements, strict=True)
-    ]
-    in_float = [
-        to_shares(part.clip(result_of(session, crop)), part.input_ranges) for crop in patches
-    ]
-    return (*layers, _rounding_row(in_float, results, source))
+    results = []
+    for crop, one in zip(patches, agreements, strict=True):
+        in_float = part.clip(result_of(session, crop))
+        images_of = (part.finish(crop, one.up), part.finish(crop, one.even), in_float)
+        results.append([to_shares(image, part.input_ranges).ravel() for image in images_of])
+    up, even, floats = map(np.concatenate, zip(*results, strict=True))
+
+    def mae(one: np.ndarray, other: np.ndarray) -> Figure:
+        return measured(float(np.abs(one - other).mean(dtype=np.float64)), "of full scale", source)
+
+    # How far the results differ, and the error of each against the float network.
+    figures = {
+        "pixels that differ": measured(100 * float((up != even).mean()), "%", source),
+        "MAE between them": mae(up, even),
+        "MAE of half up": mae(up, floats),
+        "MAE of half to even": mae(even, floats),
+    }
+    return (
+        *layers,
+        Row("rounding", "half up (DPU) against half to even (onnxruntime)", figures),
+    )
 
 
 def _layer_row(layers: list[LayerAgreement], source: str) -> Row:
@@ -142,23 +155,3 @@ def _layer_row(layers: list[LayerAgreement], source: str) -> Row:
         "at most by": measured(max(a.moved_by for a in layers), "units", f"{source}, half up"),
     }
     return Row("integer layers", layers[0].report.name, figures)
-
-
-def _rounding_row(in_float: list[np.ndarray], results: list[list[np.ndarray]], source: str) -> Row:
-    """Return a row that compares both rules for ties: the DPU rounds them up, the runtime to even.
-
-    It states how far the results differ, and the error of each against the float network.
-    """
-    up, even = (np.concatenate([pair[k].ravel() for pair in results]) for k in (0, 1))
-    floats = np.concatenate([result.ravel() for result in in_float])
-
-    def mae(one: np.ndarray, other: np.ndarray) -> Figure:
-        return measured(float(np.abs(one - other).mean(dtype=np.float64)), "of full scale", source)
-
-    figures = {
-        "pixels that differ": measured(100 * float((up != even).mean()), "%", source),
-        "MAE between them": mae(up, even),
-        "MAE of half up": mae(up, floats),
-        "MAE of half to even": mae(even, floats),
-    }
-    return Row("rounding", "half up (DPU) against half to even (onnxruntime)", figures)

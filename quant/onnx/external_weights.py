@@ -96,9 +96,10 @@ def _content(tensor: TensorProto, path: Path, limit_bytes: int) -> bytes:
     size = math.prod(tensor.dims) * VALUE_BYTES[tensor.data_type]
     if size > limit_bytes:
         raise _refused(tensor, path, f"the model would be more than {FILE_BYTES} bytes in all")
+    texts = entries.get("offset", "0"), entries.get("length", str(size))
     start, length = (
-        _byte_count(entries.get(key, default))
-        for key, default in (("offset", "0"), ("length", str(size)))
+        int(text) if text.isascii() and text.isdigit() and len(text) < 19 else None
+        for text in texts
     )
     beside = _beside(tensor, entries.get("location", ""), path)
     if start is None or length != size or start + size > beside.stat().st_size:
@@ -108,11 +109,6 @@ def _content(tensor: TensorProto, path: Path, limit_bytes: int) -> bytes:
     with beside.open("rb") as stream:
         stream.seek(start)
         return stream.read(size)
-
-
-def _byte_count(text: str) -> int | None:
-    """Parse a number of bytes; return None if the text is none."""
-    return int(text) if text.isascii() and text.isdigit() and len(text) < 19 else None
 
 
 def _beside(tensor: TensorProto, location: str, path: Path) -> Path:

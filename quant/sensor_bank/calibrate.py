@@ -66,23 +66,6 @@ BODY = "body.correction"
 """The parts of the core's result: the analytic restoration, and the body's correction of it."""
 
 
-def _assembled(body: IntCore, bank: Bank, scale: int, shifts: Shifts, kernels: Kernels) -> IntCore:
-    """Return the whole core: a bank, the body behind it, and the analytic restoration.
-
-    The body reads the bank's results as `PLANES`.
-    """
-    result = body.frac_bits[CORRECTION]
-    behind_bank = (renamed(op, {PLANES: BANK, CORRECTION: BODY}) for op in body.ops)
-    joined = Concat("joined", (BODY, ANALYTIC), CORRECTION)
-    # A concat has one scale for its inputs and its output.
-    frac_bits = dict(body.frac_bits) | {BANK: BITS, BODY: result, ANALYTIC: result}
-    decoding = BankSum(coarse_copies=coarse_copies(kernels))
-    host_part = replace(bank_host_part(scale, decoding), unit=float(np.float32(bank.unit)))
-    analytic = _analytic(scale, result, shifts, decoding, len(channels(kernels)))
-    ops = (bank_layer(bank, scale, shifts, kernels), *behind_bank, analytic, joined)
-    return IntCore(ops, frac_bits, host_part)
-
-
 def _analytic(scale: int, result: int, shifts: Shifts, decoding: BankSum, inputs: int) -> IntConv:
     """Return the convolution that averages the bank's copies of the analytic restoration.
 
@@ -263,7 +246,20 @@ def quantize_behind_bank(
         else op
         for op in body.ops
     )
-    core = _assembled(replace(body, ops=ops), bank, scale, shifts, weights.kernels)
+    # The body reads the bank's results as `PLANES`.
+    result = body.frac_bits[CORRECTION]
+    behind_bank = (renamed(op, {PLANES: BANK, CORRECTION: BODY}) for op in ops)
+    # A concat has one scale for its inputs and its output.
+    joined = Concat("joined", (BODY, ANALYTIC), CORRECTION)
+    frac_bits = dict(body.frac_bits) | {BANK: BITS, BODY: result, ANALYTIC: result}
+    kernels = weights.kernels
+    decoding = BankSum(coarse_copies=coarse_copies(kernels))
+    analytic = _analytic(scale, result, shifts, decoding, len(channels(kernels)))
+    core = IntCore(
+        (bank_layer(bank, scale, shifts, kernels), *behind_bank, analytic, joined),
+        frac_bits,
+        replace(bank_host_part(scale, decoding), unit=float(np.float32(bank.unit))),
+    )
     conditioned = ConditionedCore(core, biases, shifts)
     return replace(conditioned, core=conditioned.for_sensor(bank, (0.0,) * SENSOR_VALUES))
 
@@ -293,7 +289,7 @@ def map_steps(conditioned: ConditionedCore, weights: Weights) -> list[np.ndarray
         # Least squares over a channel's weights, each of which is rounded.
         products = (weight * quantized[name]).sum((1, 2, 3))
         factors = np.where(square > 0, products / np.maximum(square, 1e-30), 1.0)
-        return np.asarray(2.0 ** -core.frac_bits[output] / factors)
+        return 2.0 ** -core.frac_bits[output] / factors
 
     group = steps("head", 1.0, "head")
     # The weights that read the residual group hold its factors, which are taken out first.
