@@ -24,7 +24,7 @@ network loses less in INT8.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,8 +36,8 @@ from torch.autograd.function import FunctionCtx
 from torch.nn.functional import conv2d, pad, pixel_shuffle, pixel_unshuffle
 
 from beers_deploy.model.bank import FILTERS, LARGEST, SIDE_PX, WIDE, Bank, bank_of_vector
-from beers_deploy.model.family import sensor_vector
-from beers_deploy.model.io.tensors import Weights, read_weights, write_weights
+from beers_deploy.model.family import RANGES, sensor_vector
+from beers_deploy.model.io.tensors import BANKED, Weights, read_weights, write_tensors
 from beers_deploy.model.variants import BANK_PLANES, SENSOR_VALUES, Kernels, Variant
 from beers_deploy.profiles.instrument import Instrument
 
@@ -242,7 +242,11 @@ class BankedConvBEERS(Layers):
             steps: step sizes to which the maps are rounded, see `Rounding.steps`; without steps
                 they are not rounded.
         """
-        filtered = each_by_its_own(image, condition.filters)
+        # Image n, mirrored at its borders, is filtered with the kernels of its own sensor.
+        padded = pad(image, [SIDE_PX // 2] * 4, mode="reflect").transpose(0, 1)
+        kernels = condition.filters.flatten(0, 1)[:, None]
+        filtered = conv2d(padded, kernels, groups=len(image))
+        filtered = filtered.view(len(image), -1, *image.shape[-2:])
         # Both are clipped to `Bank.reach`, which is where int8 ends, so that a network trains with
         # what INT8 will show it.
         planes = filtered[:, :FILTERS]
@@ -309,19 +313,6 @@ def for_sensor(
     return OfOneSensor(network, vector, bank) if isinstance(network, BankedConvBEERS) else network
 
 
-def each_by_its_own(image: Tensor, kernels: Tensor) -> Tensor:
-    """Filter image n of (N, 1, H, W), mirrored at its borders, with kernels n of (N, K, 7, 7).
-
-    Returns:
-        The filtered images (N, K, H, W).
-    """
-    count = len(image)
-    radius = SIDE_PX // 2
-    padded = pad(image, [radius] * 4, mode="reflect")
-    filtered = conv2d(padded.transpose(0, 1), kernels.flatten(0, 1)[:, None], groups=count)
-    return filtered.view(count, -1, *image.shape[-2:])
-
-
 def initialise(network: Network, generator: torch.Generator) -> None:
     """Draw the first weights of a network, so that it changes images hardly at all.
 
@@ -370,11 +361,14 @@ def network_of(weights: Weights) -> Network:
 
 
 def save_network(path: Path, network: Network, recipe: Mapping[str, object]) -> None:
-    """Write a network's weights, its variant and the recipe that made them."""
-    weights = Weights(arrays(network.state_dict()), network.variant, dict(recipe))
+    """Write a network's weights, its variant and the recipe that made them; for a network behind a
+    bank also its sensor ranges. `read_weights` reads them.
+    """
+    header: dict[str, object] = {"variant": asdict(network.variant), "recipe": dict(recipe)}
     if isinstance(network, BankedConvBEERS):
-        weights = replace(weights, conditioned=True, kernels=network.kernels)
-    write_weights(path, weights)
+        header |= {"kind": BANKED, "ranges": dict(RANGES), "kernels": network.kernels}
+    # No interval is written, because other weights make other errors.
+    write_tensors(path, arrays(network.state_dict()), header)
 
 
 def load_network(path: Path) -> tuple[Network, dict[str, object]]:

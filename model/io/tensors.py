@@ -8,7 +8,7 @@ conditioned on a sensor, it also states its kind and the ranges of its training 
 import json
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -103,18 +103,6 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
             ) from error
         reason = fault or reason_of(error)
         raise ModelError(f"{name} holds no safetensors weights: {reason}. {TRAINED}.") from error
-
-
-def write_weights(path: Path, weights: Weights) -> None:
-    """Write a network's weights, variant and recipe; for a conditioned network also its sensor
-    ranges.
-
-    No interval is written, because other weights make other errors.
-    """
-    header: dict[str, object] = {"variant": asdict(weights.variant), "recipe": weights.recipe}
-    if weights.conditioned:
-        header |= {"kind": BANKED, "ranges": dict(RANGES), "kernels": weights.kernels}
-    write_tensors(path, weights.tensors, header)
 
 
 def read_weights(path: Path) -> Weights:

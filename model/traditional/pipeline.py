@@ -137,7 +137,11 @@ def restore_strips(
     # The converter's rounding adds a twelfth of a squared DN, which NL-Bayes must know of.
     sensor = with_rounding_noise(pipeline.degraded)
     kernel = pipeline.kernel()
-    quality = quality_named(pipeline.quality)
+    if pipeline.quality not in QUALITIES:
+        raise OptionError(
+            f"`quality` must be one of {', '.join(QUALITIES)}, got {pipeline.quality!r}."
+        )
+    quality = QUALITIES[pipeline.quality]
     if pipeline.order == "denoise-first":
         clean = denoise_radiance(radiance, height, sensor, Noise(WORKING_SIGMA), quality)
         restored = filter_strips(clean, height, kernel)
@@ -177,12 +181,3 @@ def denoise_radiance(
     for clean in nl_bayes_strips(stable, height, noise, quality):
         # The root is concave: a mean on the stabilised scale lies alpha / 4 too low.
         yield destabilise(clean / scale, sensor) + bias_radiance(sensor)
-
-
-def quality_named(name: str) -> Quality:
-    """Return the quality called "fast", "standard" or "best", or raise OptionError for another
-    name.
-    """
-    if name not in QUALITIES:
-        raise OptionError(f"`quality` must be one of {', '.join(QUALITIES)}, got {name!r}.")
-    return QUALITIES[name]

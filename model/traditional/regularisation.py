@@ -99,7 +99,16 @@ class NoiseAndScene:
         """
         residual = max(self.residual, LEAST_NOISE * self.noise)
         contrast = max(self.contrast, LEAST_CONTRAST * self.noise)
-        return residual * difference_energy(sensor) / contrast
+        # The mean squared difference of neighbouring pixels in an image of a scene whose power is
+        # 1 / r^2, with r the frequency over Nyquist.
+        fy = np.fft.fftfreq(GRID)[:, None]
+        fx = np.fft.fftfreq(GRID)[None, :]
+        r_squared = (fx**2 + fy**2) / NYQUIST**2
+        # The mean of an image is no contrast: the quotient is 0 there.
+        r_squared[0, 0] = np.inf
+        differences = 2 * np.sin(np.pi * fx) ** 2 + 2 * np.sin(np.pi * fy) ** 2
+        power = np.abs(sensor_mtf(fx, fy, sensor)) ** 2
+        return residual * float((power * differences / r_squared).mean()) / contrast
 
     @property
     def largest_epsilon(self) -> float:
@@ -218,19 +227,3 @@ def _blocks(values: Array) -> tuple[Array, Array]:
         for per_column in columns
     )
     return total, number
-
-
-def difference_energy(sensor: Instrument) -> float:
-    """Return c, the mean squared difference of neighbouring pixels in an image of a scene whose
-    power is 1 / r^2.
-
-    r is the frequency over Nyquist. Frequency 0 does not count: the mean of an image is no
-    contrast.
-    """
-    fy = np.fft.fftfreq(GRID)[:, None]
-    fx = np.fft.fftfreq(GRID)[None, :]
-    r_squared = (fx**2 + fy**2) / NYQUIST**2
-    # The mean of an image is no contrast: the quotient is 0 there.
-    r_squared[0, 0] = np.inf
-    differences = 2 * np.sin(np.pi * fx) ** 2 + 2 * np.sin(np.pi * fy) ** 2
-    return float((np.abs(sensor_mtf(fx, fy, sensor)) ** 2 * differences / r_squared).mean())

@@ -48,16 +48,10 @@ class Batch(NamedTuple):
     condition: Condition | None = None
 
 
-class Visit(NamedTuple):
-    """The patches of one pass over a scene.
-
-    Attributes:
-        patches: the degraded and the reference image of each patch, (N, 2, P, P) in [0, 1].
-        condition: the description of the sensor of each patch; None without a family of sensors.
-    """
-
-    patches: Tensor
-    condition: Condition | None
+Visit = tuple[Tensor, Condition | None]
+"""The degraded and the reference image of each patch of one pass over a scene, (N, 2, P, P) in
+[0, 1], and the description of the sensor of each; None without a family of sensors.
+"""
 
 
 class PatchSource:
@@ -122,7 +116,8 @@ class PatchSource:
         # Keyed by its number and not drawn in sequence: a resumed run makes the same shard.
         generator = Draw(self.seed, number * self.workers + self.rank).generator("shard")
         shard_size = self.batch * self.SHARD_BATCHES
-        visits = list[Visit]()
+        parts = list[Tensor]()
+        conditions = list[Condition]()
         count = 0
         for _ in range(50 * shard_size):
             scene_visit = visit(
@@ -130,8 +125,11 @@ class PatchSource:
             )
             if scene_visit is None:
                 continue
-            visits.append(scene_visit)
-            count += len(scene_visit.patches)
+            scene_patches, scene_condition = scene_visit
+            parts.append(scene_patches)
+            if scene_condition is not None:
+                conditions.append(scene_condition)
+            count += len(scene_patches)
             if count >= shard_size:
                 break
         else:
@@ -141,12 +139,12 @@ class PatchSource:
             )
         # Mixed, because neighbours of one scene would make a batch whose gradient knows one scene.
         places = torch.from_numpy(generator.permutation(count)[:shard_size])
-        patches = torch.cat([item.patches for item in visits])
+        patches = torch.cat(parts)
         patches = patches[places.to(patches.device)]
         condition = None
-        if conditions := [item.condition for item in visits if item.condition is not None]:
-            parts = zip(*conditions, strict=True)
-            condition = Condition(*(torch.cat(part)[places] for part in parts))
+        if conditions:
+            columns = zip(*conditions, strict=True)
+            condition = Condition(*(torch.cat(column)[places] for column in columns))
         return Batch(patches[:, :1].contiguous(), patches[:, 1:].contiguous(), condition)
 
 
@@ -171,7 +169,7 @@ def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -
     mirrors, quarters = sensor.symmetry
     quarter, mirrored = draw_turn(generator, quarters or recipe.family is not None, mirrors)
     if recipe.family is None:
-        return Visit(turned(patches, quarter, mirrored), None)
+        return turned(patches, quarter, mirrored), None
     return _conditioned(turned(patches, quarter, mirrored), sensor, quarter, mirrored)
 
 
@@ -201,7 +199,7 @@ def _conditioned(patches: Tensor, sensor: Instrument, quarter: int, mirrored: bo
         banks.append(Bank(details.numpy(), bank.sigma))
     condition = Condition.of(torch.stack(vectors), banks)
     scale = torch.from_numpy(factors).to(patches)[:, None, None, None]
-    return Visit(patches * scale, condition.some(torch.from_numpy(places)))
+    return patches * scale, condition.some(torch.from_numpy(places))
 
 
 def cut(images: Tensor, patch_px: int, generator: np.random.Generator) -> Tensor:

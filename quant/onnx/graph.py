@@ -53,8 +53,12 @@ class Node:
         """
         op_type = operator_name(proto, functions)
         name = proto.name or proto.output[0]
-        inputs = tuple(proto.input)
-        return cls(op_type, name, inputs, tuple(proto.output), attributes_of(proto), proto)
+        attributes = {}
+        for attribute in proto.attribute:
+            value = helper.get_attribute_value(attribute)
+            text = value.decode(errors="replace") if isinstance(value, bytes) else value
+            attributes[attribute.name] = text
+        return cls(op_type, name, tuple(proto.input), tuple(proto.output), attributes, proto)
 
     @classmethod
     def new(
@@ -331,12 +335,6 @@ def constants(model: onnx.ModelProto) -> dict[str, np.ndarray]:
             kind = np.float32 if "float" in node.attribute[0].name else None
             arrays[node.output[0]] = np.asarray(value, kind)
     return arrays
-
-
-def attributes_of(node: NodeProto) -> dict[str, Any]:
-    """Return the attributes that a node of a file states, by name, with byte strings decoded."""
-    values = {a.name: helper.get_attribute_value(a) for a in node.attribute}
-    return {k: v.decode(errors="replace") if isinstance(v, bytes) else v for k, v in values.items()}
 
 
 def sizes_of(tensor: TypeProto.Tensor) -> tuple[int, ...]:
