@@ -36,7 +36,7 @@ from beers_deploy.model.training.losses import RestorationLoss
 from beers_deploy.model.training.patches import PatchRecipe, pair_files
 from beers_deploy.model.training.source import PatchSource
 from beers_deploy.model.training.stored import StoredPairs
-from beers_deploy.model.training.trainer import Batches, Precision, Schedule, Speed, Trainer, Worker
+from beers_deploy.model.training.trainer import Batches, Precision, Schedule, Trainer, Worker
 from beers_deploy.model.training.validation import Validation, split_by_site, write_picture
 from beers_deploy.model.variants import variant_named
 from beers_deploy.profiles.errors import ModelError, OptionError
@@ -273,12 +273,12 @@ def _train(run: Run, trainer: Trainer, batches: Batches, validation: Validation)
     with steps("training", run.recipe.steps) as bar:
         bar.advance(trainer.step)
 
-        def report(step: int, terms: Mapping[str, float], speed: Speed) -> None:
-            log.write(step, {**terms, "patches_per_s": speed.patches_per_s, "waited": speed.waited})
+        def report(
+            step: int, terms: Mapping[str, float], patches_per_s: float, waited: float
+        ) -> None:
+            log.write(step, {**terms, "patches_per_s": patches_per_s, "waited": waited})
             means = ", ".join(f"{name} {value:.5f}" for name, value in terms.items())
-            rate = (
-                f"{speed.patches_per_s:.0f} patches/s in {run.precision}, waits {speed.waited:.0%}"
-            )
+            rate = f"{patches_per_s:.0f} patches/s in {run.precision}, waits {waited:.0%}"
             bar.advance(step - bar.done, f"{means}, {rate}")
 
         def validate(step: int, network: Network) -> None:

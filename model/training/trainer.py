@@ -120,28 +120,18 @@ Head, tail and sums remain float32, because 8 bits of precision would round a 12
 class Schedule:
     """The number of steps between reports, validations and checkpoints.
 
-    `report` is called with the step, the means of the loss's terms since the last report, and the
-    speed.
+    `report` is called with the step, and with what happened since the last report: the means of the
+    loss's terms, the number of patches per second, and the share of the time in which the steps
+    waited for patches.
     """
 
     report_steps: int = 100
     save_s: float = 120.0
     validate_steps: int = 0  # 0 stands for never.
-    report: Callable[[int, Mapping[str, float], "Speed"], None] = field(default=lambda *_: None)
+    report: Callable[[int, Mapping[str, float], float, float], None] = field(
+        default=lambda *_: None
+    )
     validate: Callable[[int, Network], None] = field(default=lambda *_: None)
-
-
-@dataclass(frozen=True)
-class Speed:
-    """The speed of the training since the last report.
-
-    Attributes:
-        patches_per_s: the number of patches per second.
-        waited: the share of the time in which the steps waited for patches.
-    """
-
-    patches_per_s: float
-    waited: float
 
 
 def largest_of_all(flag: Tensor) -> Tensor:
@@ -244,8 +234,8 @@ class Trainer:
                 if reports:
                     patches = len(rows) * self.recipe.batch * self.worker.count
                     elapsed_s = max(now - reported_at, 1e-9)
-                    speed = Speed(patches / elapsed_s, waited_s / elapsed_s)
-                    schedule.report(self.step, self._means(rows), speed)
+                    means = self._means(rows)
+                    schedule.report(self.step, means, patches / elapsed_s, waited_s / elapsed_s)
                     rows = []
                     reported_at = now
                     waited_s = 0.0

@@ -24,7 +24,7 @@ from beers_deploy.model.training.checkpoint import (
     finish,
 )
 from beers_deploy.model.training.source import Batch, PatchSource
-from beers_deploy.model.training.trainer import Precision, Schedule, Speed, Trainer, Worker
+from beers_deploy.model.training.trainer import Precision, Schedule, Trainer, Worker
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError, OptionError
 from tests.model.training.sources import small_scene, source
@@ -231,7 +231,7 @@ def test_a_run_goes_on_in_the_other_format_and_the_loss_with_it(
     records = list[tuple[int, float]]()
     recipe = TrainingRecipe(steps=40, batch=3, warm_up_steps=2, learning_rate=3e-3)
 
-    def note(step: int, terms: Mapping[str, float], _: Speed) -> None:
+    def note(step: int, terms: Mapping[str, float], *_: float) -> None:
         records.append((step, terms["l1"]))
         if len(records) == 2:
             raise KeyboardInterrupt
