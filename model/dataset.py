@@ -34,7 +34,6 @@ from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene, read_scene, resample
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.instrument import Instrument
-from beers_deploy.profiles.reference import require_same_units
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.toml import parse_json
 
@@ -50,7 +49,7 @@ class DatasetRecipe:
     Attributes:
         scenes: the files of the scenes; None is a scene that is drawn from the seed.
         degraded: the sensor of the images to restore.
-        reference: the sensor of the images that a restoration aims at.
+        reference: the sensor of the images that a restoration aims at, in the units of `degraded`.
         oversampling: the number of scene pixels per pixel of a pair, along each side.
         patch_px: the side of a pair in pixels; None takes whole scenes.
         radiance_scale: a factor on the radiance of every scene.
@@ -69,9 +68,6 @@ class DatasetRecipe:
     tolerance_dn: float = TOLERANCE_DN
     # Scenes are resampled by it first, where the wanted ratio is no whole number.
     scene_scale: float = 1.0
-
-    def __post_init__(self) -> None:
-        require_same_units(self.degraded, self.reference)
 
     def to_json(self) -> dict[str, object]:
         """Return the recipe as it is stored in a file; scenes are stored by name and digest."""

@@ -5,8 +5,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
-import numpy as np
-
 from beers_deploy.profiles.effects import Dsnu, Effect, Prnu, Striping, Table
 from beers_deploy.profiles.response import PointSpread, Response
 
@@ -64,13 +62,6 @@ class Instrument:
     mtf_nyquist_along: float | None = None
     radiance_1: float = 100.0
     response: Response | None = None
-
-    def __post_init__(self) -> None:
-        if self.response is not None and not np.allclose(self.mtf_axes, self.response.at_nyquist):
-            raise ValueError(
-                f"the MTF at Nyquist is {self.mtf_axes}, but the response has "
-                f"{self.response.at_nyquist} there"
-            )
 
     @property
     def blur(self) -> tuple[float, float] | Response:

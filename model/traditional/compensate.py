@@ -16,7 +16,6 @@ from torch import Tensor
 from beers_deploy.model.bank import cut_filter, restoring_gain
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.model.traditional.rows import Rows, fill_with_local_means, map_tiles, mirrored
-from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import NYQUIST
 
@@ -92,9 +91,6 @@ def compensation_kernel(degraded: Instrument, reference: Instrument, epsilon: fl
 
     Returns:
         The filter (2 R + 1, 2 R + 1) float64, with the sum 1 and R = RADIUS_PX.
-
-    Raises:
-        OptionError: epsilon is negative or not finite.
     """
     # Sampled this finely, the slow tail folds back onto the filter little.
     side = 8 * RADIUS_PX
@@ -122,15 +118,7 @@ def compensation_gain(
     Returns:
         The gain on the half spectrum, (height, width // 2 + 1) float64; complex128 if H or T is
         that of a point-spread function.
-
-    Raises:
-        OptionError: epsilon is negative or not finite.
     """
-    if not 0 <= epsilon < float("inf"):
-        raise OptionError(
-            f"epsilon must be a finite number of 0 or more, got {epsilon!r}. A few thousandths are "
-            "usual."
-        )
     fy = np.fft.fftfreq(height)[:, None]
     fx = np.fft.rfftfreq(width)[None, :]
     r_squared = (fx**2 + fy**2) / NYQUIST**2

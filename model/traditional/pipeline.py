@@ -106,7 +106,6 @@ def restore_traditional(dn: Tensor, pipeline: TraditionalPipeline) -> Tensor:
 
     Raises:
         ImageError: a pixel is infinite.
-        OptionError: the pipeline has an unknown quality or an invalid epsilon.
     """
     return torch.cat(list(restore_strips([dn], dn.shape[0], pipeline.fitted_to([dn]))))
 
@@ -130,17 +129,12 @@ def restore_strips(
 
     Raises:
         ImageError: a pixel is infinite.
-        OptionError: the pipeline has no epsilon, which `TraditionalPipeline.fitted_to` derives, or
-            an invalid parameter.
+        OptionError: the pipeline has no epsilon, which `TraditionalPipeline.fitted_to` derives.
     """
     radiance = (to_radiance(strip, pipeline.degraded) for strip in finite_or_missing(strips))
     # The converter's rounding adds a twelfth of a squared DN, which NL-Bayes must know of.
     sensor = with_rounding_noise(pipeline.degraded)
     kernel = pipeline.kernel()
-    if pipeline.quality not in QUALITIES:
-        raise OptionError(
-            f"`quality` must be one of {', '.join(QUALITIES)}, got {pipeline.quality!r}."
-        )
     quality = QUALITIES[pipeline.quality]
     if pipeline.order == "denoise-first":
         clean = denoise_radiance(radiance, height, sensor, Noise(WORKING_SIGMA), quality)

@@ -11,7 +11,6 @@ from beers_deploy.model.family import SensorFamily
 from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.training.looks import ORDINARY, Looks
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.reference import require_same_units
 from beers_deploy.profiles.sensor import Sensor
 
 
@@ -41,9 +40,6 @@ class PatchRecipe:
     margin_px: int = 16
     family: SensorFamily | None = None
     noisy_reference: bool = True
-
-    def __post_init__(self) -> None:
-        require_same_units(self.degraded, self.reference)
 
 
 def turn(

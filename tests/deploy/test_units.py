@@ -9,12 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from beers_deploy.model.dataset import DatasetRecipe
 from beers_deploy.model.simulator.mtf import mtf
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.model.training.patches import PatchRecipe
 from beers_deploy.profiles.constant import Constant
-from beers_deploy.profiles.errors import ProfileError
 from beers_deploy.profiles.reference import reference_beside
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.evaluation.methods import method_named
@@ -107,12 +104,3 @@ def test_a_named_reference_of_other_units_is_converted_and_logged(
     assert "40 DN per W/m2/sr/um, 14 bits, 5 DN of offset" in sentence
     reference_beside(DEGRADED, "pleiades-reference")
     assert len(caplog.messages) == 1
-
-
-def test_recipes_refuse_a_reference_of_other_units() -> None:
-    degraded = with_units(DEGRADED, 10, 12)
-    reference = Sensor.load("pleiades-reference")
-    with pytest.raises(ProfileError, match=r"10 DN per W/m2/sr/um, 12 bits.*10\.2375"):
-        PatchRecipe(degraded, reference)
-    with pytest.raises(ProfileError, match="reference of pleiades-degraded"):
-        DatasetRecipe((None,), degraded, reference, 2, None)

@@ -163,16 +163,6 @@ def test_a_profile_is_read_back_from_json_without_its_file(
     assert not same_instrument(other, profile)
 
 
-def test_a_contrast_that_contradicts_the_response_is_refused(tmp_path: Path) -> None:
-    sensor = Sensor.load(sensor_file(tmp_path, TABLE)).nominal()
-    with pytest.raises(ValueError, match="but the response has"):
-        replace(sensor, mtf_nyquist=0.2)
-    assert replace(sensor, mtf_nyquist=0.2, mtf_nyquist_along=None, response=None).mtf_axes == (
-        0.2,
-        0.2,
-    )
-
-
 @pytest.mark.parametrize(
     ("mtf", "words"),
     [

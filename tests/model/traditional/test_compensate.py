@@ -12,7 +12,6 @@ from beers_deploy.model.traditional.compensate import (
     filter_strips,
 )
 from beers_deploy.profiles.effects import AntiAlias, Smear
-from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.instrument import Instrument
 from tests.model.simulator import stages
 from tests.model.simulator.stages import NOMINAL, plain_sensor, with_contrast, with_response
@@ -136,9 +135,3 @@ def test_it_converts_one_blur_into_the_other() -> None:
     wrong = (compensate(blurred, 0.07, 0.20, epsilon=0) - target)[inside].square().mean()
     assert float(after) < 1e-3 * float(before)
     assert float(wrong) > 10 * float(after)
-
-
-@pytest.mark.parametrize("epsilon", [-1e-3, float("nan"), float("inf")])
-def test_an_invalid_epsilon_is_refused(epsilon: float) -> None:
-    with pytest.raises(OptionError, match="epsilon"):
-        compensation_gain(8, 8, with_contrast(0.07), REFERENCE, epsilon)

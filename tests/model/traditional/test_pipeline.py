@@ -17,7 +17,6 @@ from beers_deploy.model.traditional.pipeline import (
     restore_strips,
     restore_traditional,
 )
-from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.instrument import Instrument, noise_from_snr
 from beers_deploy.profiles.response import PointSpread
 from beers_deploy.profiles.sensor import Sensor
@@ -196,11 +195,6 @@ def test_any_bits_are_restored(bits: int, camera: Tensor) -> None:
         for dn in (pair.degraded, restored)
     )
     assert after > before + 11
-
-
-def test_an_unknown_quality_is_refused() -> None:
-    with pytest.raises(OptionError, match="fast, standard, best"):
-        restore_traditional(torch.ones(3, 3), TraditionalPipeline(NOMINAL, REFERENCE, "superb"))
 
 
 def test_the_result_stays_within_the_converter() -> None:
