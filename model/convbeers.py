@@ -87,19 +87,16 @@ class Layers(nn.Module):
         `bfloat16` the layers between head and tail compute in it, their sums stay in float32.
         """
         with torch.autocast(shallow.device.type, dtype=torch.bfloat16, enabled=bfloat16):
-            deep = (
-                self._rounded(shallow, *steps)
-                if steps
-                else shallow + self.body_end(self.body(shallow)).float()
-            )
+            if steps:
+                # Every map between head and tail is rounded.
+                step, *inner_steps = steps
+                skip = stream = in_steps(shallow, step)
+                for block, inner_step in zip(self.body, inner_steps, strict=True):
+                    stream = block(stream, step, inner_step)
+                deep = in_steps(skip + in_steps(self.body_end(stream), step), step)
+            else:
+                deep = shallow + self.body_end(self.body(shallow)).float()
         return pixel_shuffle(self.tail(deep), self.variant.scale)
-
-    def _rounded(self, shallow: Tensor, step: Tensor, *inner: Tensor) -> Tensor:
-        """Compute the input of the tail, with every map between head and tail rounded."""
-        skip = stream = in_steps(shallow, step)
-        for block, inner_step in zip(self.body, inner, strict=True):
-            stream = block(stream, step, inner_step)
-        return in_steps(skip + in_steps(self.body_end(stream), step), step)
 
 
 def in_steps(maps: Tensor, step: Tensor) -> Tensor:

@@ -181,7 +181,13 @@ class SelfCheck:
         """
         missing = np.isnan(raw) | np.isnan(restored)
         # Only far tails of the kernel see the filling, because pixels near it do not count.
-        x = _filled(restored, missing)
+        x = restored
+        if missing.all():
+            x = np.zeros_like(restored)
+        elif missing.any():
+            # Missing pixels get the value of the nearest known one.
+            nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
+            x = restored[tuple(nearest)]
         pads = []
         for placed, side in zip((down, across), x.shape, strict=True):
             # The pixels of the kernel's reach that lie beyond the image, before and after it.
@@ -224,16 +230,6 @@ class SelfCheck:
         change = _sums(np.where(counts, (x[inside] - blurred) ** 2 / variance, 0), BLOCK_PX)
         enough = np.where(pixels < LEAST_PX, np.nan, pixels)
         return Judged(chi2=squares / enough, sharpening=change / enough)
-
-
-def _filled(pixels: Image, missing: NDArray[np.bool_]) -> Image:
-    """Return pixels (h, w) whose missing ones have the value of the nearest known one."""
-    if not missing.any():
-        return pixels
-    if missing.all():
-        return np.zeros_like(pixels)
-    nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
-    return np.asarray(pixels[tuple(nearest)])
 
 
 def _sums(values: NDArray[np.generic], side: int) -> Array:

@@ -289,19 +289,15 @@ def _quantize_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts) -> IntCo
     frac_bits[op.output] = product - cut
     weight = quantize(op.weight, weight_frac_bits)
     bias, bias_frac_bits = quantize_bias(op.bias, product, shifts)
-    kind = (_activation(op, frac_bits[op.output]), op.window, op.groups, op.transposed)
+    activation = op.activation
+    # ReLU6 is ReLU where int8 ends no later than the six, as it does once `equalize` has scaled.
+    ends_first = op.ceiling is not None or INT8_MAX * 2.0 ** -frac_bits[op.output] <= SIX
+    if activation is Activation.relu6 and ends_first:
+        activation = Activation.relu
+    kind = (activation, op.window, op.groups, op.transposed)
     return IntConv(
         op.name, op.input, op.output, weight, weight_frac_bits, bias, bias_frac_bits, *kind
     )
-
-
-def _activation(op: Conv, frac_bits: int) -> Activation:
-    """Return the activation of integers.
-
-    ReLU6 is ReLU where int8 ends no later than the six, as it does once `equalize` has scaled.
-    """
-    ends_first = op.ceiling is not None or INT8_MAX * 2.0**-frac_bits <= SIX
-    return Activation.relu if op.activation is Activation.relu6 and ends_first else op.activation
 
 
 def quantize_bias(

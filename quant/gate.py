@@ -212,7 +212,12 @@ def compare(
                 f"The reference of {_name(patches, number)} must have values in [0, 1], but they "
                 f"are {reference.min():.4g} to {reference.max():.4g}. Divide it by full scale."
             )
-        errors.append([_psnr_db(image, reference) for image in (degraded, in_float, in_int8)])
+        errors.append(
+            [
+                psnr_db(image, reference, 1.0) if image.shape == reference.shape else math.nan
+                for image in (degraded, in_float, in_int8)
+            ]
+        )
         if metric:
             metric_values.append([metric_value(metric, r, reference) for r in (in_float, in_int8)])
     if unfit and len(unfit) < len(errors):
@@ -302,10 +307,6 @@ def unfit_reference(patches: Patches, number: int, purpose: str) -> ImageError:
         f"because {purpose} needs one for every sample, but {fault}. Give such references for all "
         "samples, or for none."
     )
-
-
-def _psnr_db(image: np.ndarray, reference: np.ndarray) -> float:
-    return psnr_db(image, reference, 1.0) if reference.shape == image.shape else math.nan
 
 
 def gate_row(result: GateResult, shares: Mapping[str, float] | None = None) -> Row:

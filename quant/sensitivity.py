@@ -14,7 +14,6 @@ import onnx
 from onnx import TensorProto, helper
 
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
-from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.quant.core import IntConv, IntCore, dequantized, rounded_to
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.gate import GateResult, Spread
@@ -271,18 +270,15 @@ def worst_row(number: int, patches: Patches, spread: Spread) -> Row:
     figures["mean radiance"] = measured(
         view.ground.brightness, "W/m2/sr/um", "of the simulated ground"
     )
+    # One value, or two if the axes of the sensor differ.
+    across, along = (f"{100 * value:.3g} %" for value in view.degraded.mtf_axes)
+    mtf = across if across == along else f"{across} across the track, {along} along it"
     words = {
         "scene": view.ground.scene.name,
-        "MTF at Nyquist, drawn from the profile": _mtf(view.degraded),
+        "MTF at Nyquist, drawn from the profile": mtf,
         "scene pixels a pixel, drawn": str(view.ground.oversampling),
     }
     return Row("worst patches", f"patch {number}", figures, words)
-
-
-def _mtf(sensor: Instrument) -> str:
-    """Format the MTF at Nyquist of the sensor profile: one value, or two if its axes differ."""
-    across, along = (f"{100 * value:.3g} %" for value in sensor.mtf_axes)
-    return across if across == along else f"{across} across the track, {along} along it"
 
 
 def sizes_row(spread: Spread) -> Row:

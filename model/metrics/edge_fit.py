@@ -234,10 +234,22 @@ def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fi
         converged = ~astray & (gamma_change < CONVERGED)
         # Each edge has its own count of passes: what has converged leaves the batch.
         for k in np.flatnonzero(converged):
-            at = active[k]
-            fits[at] = _judged(
-                lines, solved, int(k), int(mask[k].sum()) - 5, pixels[at], limits, bool(shape)
-            )
+            own_gamma = float(lines.gamma[k])
+            chi2 = float(solved.chi2[k])
+            step = float(solved.step[k])
+            count_px = int(mask[k].sum()) - 5
+            scatter = chi2 / count_px
+            misfit = math.sqrt(max(scatter - 1, 0.0)) / max(step, 1e-9)
+            # By chance less than the noise may be left, which makes no error smaller.
+            error = math.sqrt(float(solved.variance[k]) * max(scatter, 1.0))
+            if misfit > limits.misfit or step < limits.step_sigma or error > limits.error:
+                continue
+            # Sharper than a detector's pixel, or softer than any profile: no plain edge.
+            least = 0.0 if shape else LEAST_GAMMA
+            if limits is ANY or least <= own_gamma < LARGEST_GAMMA:
+                line = (float(lines.slope[k]), float(lines.place[k]))
+                at = active[k]
+                fits[at] = EdgeBlur(own_gamma, error, *line, pixels[at], chi2, count_px)
         lines = lines.only(~astray & ~converged)
         active = active[~astray & ~converged]
         if not active.size:
@@ -304,28 +316,3 @@ def _solve(
     change = (covariance @ (terms @ residuals[:, :, None]))[:, 2:, 0]
     span = np.where(mask, fitted, -np.inf).max(1) - np.where(mask, fitted, np.inf).min(1)
     return _Solved(change, covariance[:, 4, 4], span, (residuals**2).sum(1))
-
-
-def _judged(
-    lines: _Lines,
-    solved: _Solved,
-    k: int,
-    count: int,
-    pixels: np.ndarray,
-    limits: Limits,
-    steeper: bool,
-) -> Fit:
-    """Return edge `k`, or None if it is not within the limits."""
-    gamma = float(lines.gamma[k])
-    chi2 = float(solved.chi2[k])
-    step = float(solved.step[k])
-    scatter = chi2 / count
-    misfit = math.sqrt(max(scatter - 1, 0.0)) / max(step, 1e-9)
-    # By chance less than the noise may be left, which makes no error smaller.
-    error = math.sqrt(float(solved.variance[k]) * max(scatter, 1.0))
-    # Sharper than a detector's pixel, or softer than any profile: no plain edge.
-    if limits is not ANY and not LEAST_GAMMA * (not steeper) <= gamma < LARGEST_GAMMA:
-        return None
-    if misfit > limits.misfit or step < limits.step_sigma or error > limits.error:
-        return None
-    return EdgeBlur(gamma, error, float(lines.slope[k]), float(lines.place[k]), pixels, chi2, count)

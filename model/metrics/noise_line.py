@@ -156,7 +156,14 @@ def fit_noise(blocks: Blocks, incomplete: bool = False) -> NoiseModel | Refusal:
     if one_level and not incomplete:
         return Refusal(f"all even areas have {dark:.4g} to {bright:.4g} DN, too narrow for a line")
     generator = np.random.default_rng(SEED)
-    draws = np.array([_fitted(quiet, _weights(quiet.part, parts, generator)) for _ in range(DRAWS)])
+    numbers = np.searchsorted(parts, quiet.part)
+    fits = []
+    for _ in range(DRAWS):
+        # Parts are drawn with replacement: the weight of a block is how often its part is drawn.
+        drawn = generator.integers(parts.size, size=parts.size)
+        counts = np.bincount(drawn, minlength=parts.size).astype(np.float64)
+        fits.append(_fitted(quiet, counts[numbers]))
+    draws = np.array(fits)
     if one_level:
         fit, draws = _of_one_level(quiet, fit, draws, generator)
     leak = float(
@@ -253,12 +260,6 @@ def _fitted(blocks: Blocks, weights: np.ndarray, band: np.ndarray | None = None)
         fit, _ = nnls(terms * root[:, None], band * root)
         size = np.maximum(terms @ fit, 0.3 * ROUNDING)
     return fit
-
-
-def _weights(part: np.ndarray, parts: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Draw parts with replacement, and return how often each block is drawn, (N,)."""
-    counts = np.bincount(generator.integers(parts.size, size=parts.size), minlength=parts.size)
-    return counts[np.searchsorted(parts, part)].astype(np.float64)
 
 
 def _with_colour(blocks: Blocks, model: NoiseModel) -> NoiseModel:

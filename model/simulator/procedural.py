@@ -63,21 +63,15 @@ def _fields(
             parcel = box(corner, step - 12, step - 12, generator.uniform(-0.06, 0.06))
             base = float(generator.choice([38, 55, 70, 88]))
             draw.polygon(parcel, fill=base)
-            _rows(draw, parcel, base, generator)
-
-
-def _rows(
-    draw: ImageDraw.ImageDraw, parcel: list[Point], base: float, generator: np.random.Generator
-) -> None:
-    """Draw crop rows 6 to 14 pixels apart, between two opposite sides of the parcel."""
-    (ax, ay), (bx, by), (cx, cy), (dx, dy) = parcel
-    count = int(700 / generator.uniform(6, 14))
-    contrast = generator.uniform(0.85, 1.2)
-    for k in range(count):
-        t = (k + 0.5) / count
-        start = (ax + t * (bx - ax), ay + t * (by - ay))
-        end = (dx + t * (cx - dx), dy + t * (cy - dy))
-        draw.line([start, end], fill=base * contrast, width=3)
+            # Crop rows 6 to 14 pixels apart, between two opposite sides of the parcel.
+            (ax, ay), (bx, by), (cx, cy), (dx, dy) = parcel
+            count = int(step / generator.uniform(6, 14))
+            contrast = generator.uniform(0.85, 1.2)
+            for k in range(count):
+                t = (k + 0.5) / count
+                start = (ax + t * (bx - ax), ay + t * (by - ay))
+                end = (dx + t * (cx - dx), dy + t * (cy - dy))
+                draw.line([start, end], fill=base * contrast, width=3)
 
 
 def _forest(

@@ -65,6 +65,12 @@ def c_program(core: IntCore, tile_px: int, title: str) -> str:
         f"{channels}}}; /* {plain(name)} */"
         for k, (name, (channels, rows, columns)) in enumerate(shapes.items())
     ]
+    calls = [
+        f"from_planes(in, {writer.maps[PLANES]});",
+        *writer.calls,
+        f"to_planes({writer.maps[CORRECTION]}, out);",
+    ]
+    body = "\n".join(f"    {line}" for line in calls)
     parts = [
         head,
         "#include <stdint.h>",
@@ -78,7 +84,7 @@ def c_program(core: IntCore, tile_px: int, title: str) -> str:
         "\n".join(f"static int8_t buffer_{k}[{size}];" for k, size in enumerate(buffers)),
         "\n".join(maps),
         "\n\n".join(writer.constants),
-        _run(writer),
+        f"void run(const int8_t *in, int8_t *out)\n{{\n{body}\n}}",
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -101,16 +107,3 @@ def _shapes(core: IntCore, tile_px: int) -> dict[str, Shape]:
         for value in values
     }
     return {name: sizes[name] for name in (PLANES, *(op.output for op in core.ops))}
-
-
-def _run(writer: LayerWriter) -> str:
-    """Return the C function `run`, which converts the planes, calls every layer and stores the
-    result.
-    """
-    lines = [
-        f"from_planes(in, {writer.maps[PLANES]});",
-        *writer.calls,
-        f"to_planes({writer.maps[CORRECTION]}, out);",
-    ]
-    body = "\n".join(f"    {line}" for line in lines)
-    return f"void run(const int8_t *in, int8_t *out)\n{{\n{body}\n}}"
