@@ -68,41 +68,31 @@ def asked(runtime: str, convolve: Convolve) -> bool:
     return half of the sum of the largest numbers, with which this is tested.
     """
     import numpy as np
-
-    image = np.full((1, CHANNELS, SIDE_PX, SIDE_PX), ACTIVATION, np.uint8)
-    exact = bool((convolve(_largest_convolution(), image) == RESULT).all())
-    words = "add exactly" if exact else "saturate; layers are computed in ways that do not"
-    _decided[f"int8 on {runtime}"] = f"its kernels {words}"
-    return exact
-
-
-def _largest_convolution() -> bytes:
-    """Build an ONNX file: one window over the whole image, all weights largest, the sum scaled to
-    RESULT.
-    """
-    import numpy as np
     from onnx import TensorProto, helper, numpy_helper
 
+    # One window over the whole image, all weights largest, the sum scaled to RESULT.
     weight = np.full((CHANNELS, CHANNELS, SIDE_PX, SIDE_PX), WEIGHT, np.int8)
-    scale = np.float32(ACTIVATION * WEIGHT * weight[0].size / RESULT)
     values = {
         "one": np.float32(1),
         "zero": np.uint8(0),
         "weight": weight,
         "signed_zero": np.int8(0),
-        "scale": scale,
+        "scale": np.float32(ACTIVATION * WEIGHT * weight[0].size / RESULT),
     }
     feeds = ["image", "one", "zero", "weight", "one", "signed_zero", "scale", "zero"]
-    sizes = {"image": SIDE_PX, "result": 1}
     ends = [
         helper.make_tensor_value_info(name, TensorProto.UINT8, [1, CHANNELS, px, px])
-        for name, px in sizes.items()
+        for name, px in (("image", SIDE_PX), ("result", 1))
     ]
     constants = [numpy_helper.from_array(np.asarray(value), name) for name, value in values.items()]
     node = helper.make_node("QLinearConv", feeds, ["result"])
     graph = helper.make_graph([node], "largest", ends[:1], ends[1:], constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    return bytes(model.SerializeToString())
+    image = np.full((1, CHANNELS, SIDE_PX, SIDE_PX), ACTIVATION, np.uint8)
+    exact = bool((convolve(model.SerializeToString(), image) == RESULT).all())
+    words = "add exactly" if exact else "saturate; layers are computed in ways that do not"
+    _decided[f"int8 on {runtime}"] = f"its kernels {words}"
+    return exact
 
 
 COMM = Path("/proc/self/comm")

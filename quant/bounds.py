@@ -60,7 +60,9 @@ def layer_bounds(core: IntCore) -> list[LayerBound]:
     Returns:
         One `LayerBound` per operation, in the order of the operations.
     """
-    ranges: dict[str, Range] = {PLANES: _planes(core)}
+    channels = core.host_part.channels
+    first, last = (np.repeat(end, channels) for end in core.host_part.encoding.limits)
+    ranges: dict[str, Range] = {PLANES: (first, last)}
     bounds = []
     for op in core.ops:
         low, high, shift = _accumulated(core, op, [ranges[name] for name in op.inputs])
@@ -83,12 +85,6 @@ def within_int8(core: IntCore) -> set[str]:
         for op, bound in zip(core.ops, layer_bounds(core), strict=True)
         if bound.low >= INT8_MIN and bound.high <= INT8_MAX
     }
-
-
-def _planes(core: IntCore) -> Range:
-    low, high = core.host_part.encoding.limits
-    channels = core.host_part.channels
-    return np.repeat(low, channels), np.repeat(high, channels)
 
 
 Accumulated = tuple[np.ndarray, np.ndarray, int]

@@ -165,7 +165,20 @@ class Consistency:
         values = values[:RANK]
         right = right[:RANK]
         down = (left * values).T
-        far = _far_weights(kernel, down.T @ right)[::-1, ::-1]
+        separable = down.T @ right
+        # The far part: a filter f is applied to a block of constant value, d blocks away. The mean
+        # of the result over one block is the sum over the offsets e of f(8 d + e) (8 - |e_y|)
+        # (8 - |e_x|) / 64.
+        remainder = kernel.copy()
+        offsets = np.arange(-NEAR_PX, NEAR_PX + 1)
+        remainder[np.ix_(offsets, offsets)] -= separable
+        ramp = np.maximum(BLOCK_PX - np.abs(np.fft.fftfreq(GRID, 1 / GRID)), 0)
+        overlap = np.outer(ramp, ramp) / BLOCK_PX**2
+        summed = np.fft.ifft2(np.fft.fft2(remainder) * np.fft.fft2(overlap)).real
+        far = centre(summed[::BLOCK_PX, ::BLOCK_PX], FAR_BLOCKS)
+        # The weight beyond the farthest blocks is spread over all of them, so that a constant image
+        # does not change.
+        far = (far + (1 - separable.sum() - far.sum()) / far.size)[::-1, ::-1]
         means, excess = _clipped_noise(sensor, scale)
         return cls(
             rows=window_weights(down, BLOCK_PX),
@@ -286,23 +299,6 @@ def blur_between(sensor: Instrument, reference: Instrument) -> Array:
 def centre(kernel: Array, radius: int) -> Array:
     """Cut a filter that is centred on its first element to (2 R + 1, 2 R + 1)."""
     return np.roll(kernel, (radius, radius), (0, 1))[: 2 * radius + 1, : 2 * radius + 1]
-
-
-def _far_weights(kernel: Array, near: Array) -> Array:
-    """Compute the weights of the surrounding block means in the mean of H x, without the near part.
-
-    A filter f is applied to a block of constant value, d blocks away. The mean of the result over
-    one block is the sum of f(8 d + e) (8 - |e_y|) (8 - |e_x|) / 64 over the offsets e. The weight
-    beyond the farthest blocks is spread over all of them, so that a constant image does not change.
-    """
-    remainder = kernel.copy()
-    offsets = np.arange(-NEAR_PX, NEAR_PX + 1)
-    remainder[np.ix_(offsets, offsets)] -= near
-    ramp = np.maximum(BLOCK_PX - np.abs(np.fft.fftfreq(GRID, 1 / GRID)), 0)
-    overlap = np.outer(ramp, ramp) / BLOCK_PX**2
-    summed = np.fft.ifft2(np.fft.fft2(remainder) * np.fft.fft2(overlap)).real
-    weights = centre(summed[::BLOCK_PX, ::BLOCK_PX], FAR_BLOCKS)
-    return np.asarray(weights + (1 - near.sum() - weights.sum()) / weights.size)
 
 
 def _clipped_noise(sensor: Instrument, full_scale: float) -> tuple[Image, Image]:

@@ -117,7 +117,15 @@ def plain_squares(
     rows, columns = (places[numbers][:, None, None] for places in (rows, columns))
     squares = image[rows + reach[:, None], columns + reach]
     valid = ((squares > 0) & (squares < clipped_at)).all((1, 2))
-    return squares[valid & _flat(squares, noise, roughness)][: effort.fits]
+    # The three outer columns on either side scatter by noise alone. The tails of the blur slope:
+    # what a column does along itself is what counts.
+    left = squares[:, :, :3]
+    right = squares[:, :, -3:]
+    step = np.abs(right.mean((1, 2)) - left.mean((1, 2)))
+    scatter = [_scatter(side) - noise(side).mean((1, 2)) for side in (left, right)]
+    flat = np.sqrt(np.maximum(np.maximum(*scatter), 0)) < roughness * step
+    plain: np.ndarray = squares[valid & flat]
+    return plain[: effort.fits]
 
 
 def _steepest(steepness: np.ndarray, effort: Effort) -> tuple[np.ndarray, np.ndarray]:
@@ -163,18 +171,6 @@ def _steepness(image: np.ndarray, noise: Noise, step_px: int) -> np.ndarray:
     # A mean of 5 rows less another one has 2 / 5 of a pixel's variance.
     deviation = np.sqrt(2 / 5 * noise(column(row(0), 0)))
     return np.where(down > across, 0, across / deviation)
-
-
-def _flat(squares: np.ndarray, noise: Noise, roughness: float) -> np.ndarray:
-    """Return True for each square whose three outer columns on either side scatter by noise alone,
-    (N,).
-    """
-    left = squares[:, :, :3]
-    right = squares[:, :, -3:]
-    step = np.abs(right.mean((1, 2)) - left.mean((1, 2)))
-    # The tails of the blur slope: what a column does along itself is what counts.
-    scatter = [_scatter(side) - noise(side).mean((1, 2)) for side in (left, right)]
-    return np.asarray(np.sqrt(np.maximum(np.maximum(*scatter), 0)) < roughness * step)
 
 
 def _scatter(side: np.ndarray) -> np.ndarray:

@@ -62,7 +62,15 @@ def edge_mtf(image: np.ndarray, angle_deg: float, saturated: float = math.inf) -
     distance = _distance(pixels, math.radians(angle_deg))
     if isinstance(distance, Refusal):
         return distance
-    plateaus = _fit_plateaus(pixels, distance)
+    # Both sides by least squares, from all pixels beyond the window.
+    beyond_window = np.abs(distance) > WINDOW_PX
+    d = distance[beyond_window]
+    v = pixels[beyond_window]
+    terms = np.stack([d < 0, d > 0, -1 / d], axis=1).astype(np.float64)
+    low, high, tail = (float(c) for c in np.linalg.lstsq(terms, v, rcond=None)[0])
+    sigma = float(np.sqrt(np.mean((v - terms @ (low, high, tail)) ** 2)))
+    tail_px = max(math.pi * tail / (high - low), 0.0) if high > low else 0.0
+    plateaus = Plateaus(low, high - low, tail_px, sigma)
     if not plateaus.step > MIN_CONTRAST_SIGMA * plateaus.sigma:
         contrast = f"a step of {plateaus.step:.4g} in noise of {plateaus.sigma:.4g}"
         return Refusal(f"{contrast}, {MIN_CONTRAST_SIGMA} times are needed")
@@ -152,18 +160,6 @@ class Plateaus:
         return np.asarray(
             self.low + self.step * (0.5 + (f[1] - f[0]) * waves @ self.transfer(f, softness_px))
         )
-
-
-def _fit_plateaus(image: np.ndarray, distance: np.ndarray) -> Plateaus:
-    """Fit both sides by least squares, using all pixels beyond the window."""
-    beyond_window = np.abs(distance) > WINDOW_PX
-    d = distance[beyond_window]
-    v = image[beyond_window]
-    terms = np.stack([d < 0, d > 0, -1 / d], axis=1).astype(np.float64)
-    low, high, tail = (float(c) for c in np.linalg.lstsq(terms, v, rcond=None)[0])
-    sigma = float(np.sqrt(np.mean((v - terms @ (low, high, tail)) ** 2)))
-    tail_px = max(math.pi * tail / (high - low), 0.0) if high > low else 0.0
-    return Plateaus(low, high - low, tail_px, sigma)
 
 
 def _mtf(image: np.ndarray, distance: np.ndarray, plateaus: Plateaus) -> float:

@@ -152,19 +152,15 @@ def disk_errors(output: Path | str | None = None) -> Iterator[None]:
         yield
     except Exception as error:
         # GDAL does not state that the disk is full, but Python does if the file cannot grow either.
-        if output is not None and not isinstance(error, CODE_FAULTS):
-            _require_room(Path(output))
+        path = None if output is None or isinstance(error, CODE_FAULTS) else Path(output)
+        if path is not None and path.is_file():
+            # A tile's size appended raises the OSError of a full disk.
+            with path.open("ab") as file:
+                file.write(bytes(ROOM_BYTES))
         # RasterioIOError is an OSError, and names its cause instead of itself.
         if isinstance(error, (OSError, *CODE_FAULTS)) and error.__cause__ is None:
             raise
         raise OSError(" ".join(str(error.__cause__ or error).split())) from error
-
-
-def _require_room(path: Path) -> None:
-    """Append a tile's size to an unfinished file, which raises the OSError of a full disk."""
-    if path.is_file():
-        with path.open("ab") as file:
-            file.write(bytes(ROOM_BYTES))
 
 
 def _profile(raster: Raster, compression: Compression) -> dict[str, Any]:

@@ -34,8 +34,7 @@ from beers_deploy.model.training.checkpoint import TrainingRecipe, finish, requi
 from beers_deploy.model.training.grow import grow
 from beers_deploy.model.training.losses import RestorationLoss
 from beers_deploy.model.training.patches import PatchRecipe, pair_files
-from beers_deploy.model.training.source import PatchSource
-from beers_deploy.model.training.stored import StoredPairs
+from beers_deploy.model.training.source import PatchSource, StoredPairs
 from beers_deploy.model.training.trainer import Batches, Precision, Schedule, Trainer, Worker
 from beers_deploy.model.training.validation import Validation, split_by_site, write_picture
 from beers_deploy.model.variants import variant_named

@@ -1,8 +1,7 @@
 """The integer core as one C99 file: integers only, static buffers, no heap, no library.
 
-- `program`: the whole file;
+- `program`: the whole file, and which tensors share a buffer;
 - `layers`: the constants and the call of each operation;
-- `memory`: which tensors share a buffer;
 - `kernels/`: the C functions that the calls use, one file for each kind of operation.
 """
 

@@ -76,15 +76,13 @@ class Window:
             kernel: rows and columns of the kernel.
             size: rows and columns of the map.
         """
-        total = (0, 0)
+        total = [0, 0]
         if auto_pad != "VALID":
-            total = self._missing(0, kernel, size), self._missing(1, kernel, size)
+            for axis, stride in enumerate(self.strides):
+                beyond = self.extent(axis, kernel[axis]) - stride
+                total[axis] = max(beyond + -size[axis] % stride, 0)
         less = [t // 2 for t in total]
         more = [t - t // 2 for t in total]
         # Of an odd number SAME_LOWER puts the extra pixel before the map, SAME_UPPER behind it.
         begin, end = (more, less) if auto_pad == "SAME_LOWER" else (less, more)
         return replace(self, pads=(begin[0], begin[1], end[0], end[1]))
-
-    def _missing(self, axis: int, kernel: Pair, size: Pair) -> int:
-        stride = self.strides[axis]
-        return max(self.extent(axis, kernel[axis]) - stride + -size[axis] % stride, 0)

@@ -204,15 +204,12 @@ def shaped(values: Array) -> NDArray[np.int64]:
         slope += COVARIANCE[up] - COVARIANCE[down]
 
 
-def _covariance() -> Array:
-    places = np.indices((SIDE_PX, SIDE_PX)).reshape(2, -1).T
-    distance = np.linalg.norm(places[:, None] - places[None, :], axis=-1)
-    return _on_grid(np.exp(-distance / REACH_PX))
-
-
 def _on_grid(values: Array) -> Array:
     """Round to so few bits that sums of 49 products are exact in float64, in any order."""
     return np.asarray(np.rint(np.ldexp(values, GRID_BITS)) / 2**GRID_BITS)
 
 
-COVARIANCE = _covariance()
+_PLACES = np.indices((SIDE_PX, SIDE_PX)).reshape(2, -1).T
+_DISTANCE_PX = np.linalg.norm(_PLACES[:, None] - _PLACES[None, :], axis=-1)
+COVARIANCE = _on_grid(np.exp(-_DISTANCE_PX / REACH_PX))
+"""The covariance of the 49 pixels of a square of natural images."""

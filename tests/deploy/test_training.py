@@ -15,7 +15,7 @@ from beers_deploy.model.io.tensors import read_tensors
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.training import run as training
 from beers_deploy.model.training.run import Log
-from beers_deploy.model.training.stored import StoredPairs
+from beers_deploy.model.training.source import StoredPairs
 from beers_deploy.model.variants import VARIANTS
 from tests.deploy.command_line import done, refused
 from tests.model.networks import behind_a_bank

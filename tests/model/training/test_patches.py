@@ -18,8 +18,7 @@ from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.training.looks import Looks
 from beers_deploy.model.training.patches import draw_turn, pair_files, turn
-from beers_deploy.model.training.source import Batch, PatchSource, cut
-from beers_deploy.model.training.stored import StoredPairs
+from beers_deploy.model.training.source import Batch, PatchSource, StoredPairs, cut
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import MtfTable

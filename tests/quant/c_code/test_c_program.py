@@ -12,7 +12,7 @@ from beers_deploy.model.shipped import shipped_names
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.c_code import c_program
 from beers_deploy.quant.c_code.layers import LayerWriter
-from beers_deploy.quant.c_code.memory import share_buffers
+from beers_deploy.quant.c_code.program import share_buffers
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import CORRECTION, PLANES
