@@ -178,22 +178,6 @@ class _Lines(NamedTuple):
         return _Lines(*(column[index] for column in self))
 
 
-class _Solved(NamedTuple):
-    """The linearised problem of N edges.
-
-    Attributes:
-        change: (N, 3) of place, slope and gamma.
-        variance: (N,) of gamma.
-        step: (N,) range of the fitted pixels near the edge.
-        chi2: (N,) sum of squares that is left of them.
-    """
-
-    change: np.ndarray
-    variance: np.ndarray
-    step: np.ndarray
-    chi2: np.ndarray
-
-
 def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fit]:
     """Fit the blur of edges as `fit_blurs` does, for one shape of the curve only: exp(-gamma f -
     shape f^2) sinc(f).
@@ -223,8 +207,8 @@ def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fi
         lines = lines.only(enough)
         active = active[enough]
         mask = mask[enough]
-        solved = _solve(lines, across, down, values[active], mask, shape)
-        place, slope, softer = np.clip(solved.change, -MAX_STEP, MAX_STEP).T
+        change, variance, steps, chi2s = _solve(lines, across, down, values[active], mask, shape)
+        place, slope, softer = np.clip(change, -MAX_STEP, MAX_STEP).T
         gamma = np.clip(lines.gamma + softer, 0.0, float(GAMMAS[-1]))
         gamma_change = np.abs(gamma - lines.gamma)
         lines = _Lines(lines.place + place, lines.slope + slope, gamma)
@@ -235,13 +219,13 @@ def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fi
         # Each edge has its own count of passes: what has converged leaves the batch.
         for k in np.flatnonzero(converged):
             own_gamma = float(lines.gamma[k])
-            chi2 = float(solved.chi2[k])
-            step = float(solved.step[k])
+            chi2 = float(chi2s[k])
+            step = float(steps[k])
             count_px = int(mask[k].sum()) - 5
             scatter = chi2 / count_px
             misfit = math.sqrt(max(scatter - 1, 0.0)) / max(step, 1e-9)
             # By chance less than the noise may be left, which makes no error smaller.
-            error = math.sqrt(float(solved.variance[k]) * max(scatter, 1.0))
+            error = math.sqrt(float(variance[k]) * max(scatter, 1.0))
             if misfit > limits.misfit or step < limits.step_sigma or error > limits.error:
                 continue
             # Sharper than a detector's pixel, or softer than any profile: no plain edge.
@@ -281,7 +265,7 @@ def centroids(regions: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> _Li
 
 def _solve(
     lines: _Lines, x: np.ndarray, y: np.ndarray, values: np.ndarray, mask: np.ndarray, shape: float
-) -> _Solved:
+) -> tuple[np.ndarray, ...]:
     """Solve for the levels of both sides, then for small changes of all five numbers, of each edge.
 
     Args:
@@ -291,6 +275,10 @@ def _solve(
         values: (N, P) pixels.
         mask: (N, P) bool, True for the pixels near each edge, which are fitted.
         shape: the coefficient of the curve's Gaussian part.
+
+    Returns:
+        The changes of place, slope and gamma, (N, 3); and the variance of gamma, the range of the
+        fitted pixels near the edge, and the sum of squares that is left of them, (N,) each.
     """
     lean = np.sqrt(1 + lines.slope**2)[:, None]
     distance = (x - lines.place[:, None] - lines.slope[:, None] * y) / lean
@@ -315,4 +303,4 @@ def _solve(
     residuals = values - fitted
     change = (covariance @ (terms @ residuals[:, :, None]))[:, 2:, 0]
     span = np.where(mask, fitted, -np.inf).max(1) - np.where(mask, fitted, np.inf).min(1)
-    return _Solved(change, covariance[:, 4, 4], span, (residuals**2).sum(1))
+    return change, covariance[:, 4, 4], span, (residuals**2).sum(1)

@@ -81,22 +81,6 @@ class EdgeLine(NamedTuple):
     bow_px: float = 0.0
 
 
-class Side(NamedTuple):
-    """The pixels within HALF_PX of an edge on both sides, (P,) each.
-
-    Attributes:
-        distance_px: the signed distance from the edge; negative on the left.
-        along_px: the row, relative to the middle.
-        values: the pixel values.
-        variance: the variance of the noise of each pixel.
-    """
-
-    distance_px: np.ndarray
-    along_px: np.ndarray
-    values: np.ndarray
-    variance: np.ndarray
-
-
 @dataclass(frozen=True)
 class FittedEdge:
     """An edge whose line and planes are known for one curve.
@@ -145,42 +129,40 @@ def fit_edge(
     texture = 0.0
     fitted = None
     for _ in range(passes):
-        near = _near(pixels, line)
-        left = near.distance_px < -2
-        right = near.distance_px > 2
+        distance_px, along_px, values, variance = _near(pixels, line)
+        left = distance_px < -2
+        right = distance_px > 2
         if min(left.sum(), right.sum()) < 4 * HALF_PX:
             return None
         if levels is None:
-            levels = np.array(
-                [np.median(near.values[left]), 0, 0, np.median(near.values[right]), 0, 0]
-            )
+            levels = np.array([np.median(values[left]), 0, 0, np.median(values[right]), 0, 0])
         step = levels[3] - levels[0]
         if step == 0:
             return None
-        ones = np.ones_like(near.along_px)
+        ones = np.ones_like(along_px)
         # The derivatives of each pixel by the three parameters of a plane.
-        plane = np.stack([ones, 2 * near.along_px / height, near.distance_px / HALF_PX], axis=1)
-        share = at_distances(edge_table, near.distance_px)[:, None]
+        plane = np.stack([ones, 2 * along_px / height, distance_px / HALF_PX], axis=1)
+        share = at_distances(edge_table, distance_px)[:, None]
         by_levels = np.hstack([plane * (1 - share), plane * share])
-        rest = near.values - by_levels @ levels
+        rest = values - by_levels @ levels
         scale = max(MAD * float(np.median(np.abs(rest))), 1e-9)
         # Cars, branches and drains lie next to edges, so pixels with large residuals count less.
         huber = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(rest), 1e-9))
         # A residual beyond the noise is texture, which lowers the weight of the edge.
-        texture = max(float(np.average(rest**2, weights=huber)) - float(near.variance.mean()), 0.0)
-        pixel_weights = np.sqrt(huber / (near.variance + texture))
+        texture = max(float(np.average(rest**2, weights=huber)) - float(variance.mean()), 0.0)
+        pixel_weights = np.sqrt(huber / (variance + texture))
         rise = plane @ (levels[3:] - levels[:3])
-        by_line = _by_line(near, line, rise * at_distances(line_table, near.distance_px), height)
+        by_line = _by_line(along_px, line, rise * at_distances(line_table, distance_px), height)
         expected, expected_rest = _expectations(levels, line, step)
         normal = np.vstack([np.hstack([by_levels, by_line]) * pixel_weights[:, None], expected])
         curve = np.vstack(
             [
-                (rise * pixel_weights)[:, None] * at_distances(edges, near.distance_px),
+                (rise * pixel_weights)[:, None] * at_distances(edges, distance_px),
                 np.zeros((NUMBERS, PARTS)),
             ]
         )
         weighted_rest = np.concatenate([rest * pixel_weights, expected_rest])
-        strip = np.floor((near.along_px + height / 2) / STRIP_PX).astype(int)
+        strip = np.floor((along_px + height / 2) / STRIP_PX).astype(int)
         unevenness = math.sqrt(texture) / abs(step)
         fitted = FittedEdge(
             pixels,
@@ -199,8 +181,11 @@ def fit_edge(
     return fitted
 
 
-def _near(pixels: EdgePixels, line: EdgeLine) -> Side:
-    """Return the pixels within HALF_PX of the line on both sides."""
+def _near(pixels: EdgePixels, line: EdgeLine) -> tuple[np.ndarray, ...]:
+    """Return the pixels within HALF_PX of the line on both sides: the signed distance of each from
+    the edge, negative on the left; its row, relative to the middle; its value; and the variance of
+    its noise, (P,) each.
+    """
     height, width = pixels.values.shape
     y, x = np.mgrid[:height, :width].astype(np.float64)
     y -= (height - 1) / 2
@@ -208,16 +193,15 @@ def _near(pixels: EdgePixels, line: EdgeLine) -> Side:
     across = x - line.place_px - line.slope * y - line.bow_px * (2 * y / height) ** 2
     distance_px = across / math.hypot(1, line.slope)
     near = np.abs(distance_px) <= HALF_PX
-    return Side(distance_px[near], y[near], pixels.values[near], pixels.variance[near])
+    return distance_px[near], y[near], pixels.values[near], pixels.variance[near]
 
 
-def _by_line(near: Side, line: EdgeLine, slope: np.ndarray, height: int) -> np.ndarray:
-    """Return the derivatives (P, 3) of the pixels by place, slope and bow.
+def _by_line(along: np.ndarray, line: EdgeLine, slope: np.ndarray, height: int) -> np.ndarray:
+    """Return the derivatives (P, 3) of the pixels by place, slope and bow, from their rows `along`.
 
     `slope` (P,) is the derivative by the distance.
     """
     by_place = -slope / math.hypot(1, line.slope)
-    along = near.along_px
     return np.stack([by_place, by_place * along, by_place * (2 * along / height) ** 2], axis=1)
 
 
