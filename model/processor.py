@@ -108,9 +108,21 @@ def processor_name() -> str | None:
     None if the system states no name, and under user-mode emulation, where the stated name is that
     of the host's processor.
     """
-    ways = {"Linux": _linux_name, "Darwin": _macos_name, "Windows": _windows_name}
+    system = platform.system()
+    name = ""
     try:
-        name = ways.get(platform.system(), str)()
+        if system == "Linux":
+            name = _linux_name()
+        elif system == "Darwin":
+            command = ["/usr/sbin/sysctl", "-n", "machdep.cpu.brand_string"]
+            name = subprocess.run(  # noqa: S603
+                command, capture_output=True, encoding="utf-8", timeout=5, check=True
+            ).stdout
+        elif sys.platform == "win32":
+            import winreg
+
+            with winreg.OpenKey(winreg.HKEY_LOCAL_MACHINE, WINDOWS_KEY) as key:
+                name = str(winreg.QueryValueEx(key, "ProcessorNameString")[0])
     except (OSError, subprocess.SubprocessError):
         return None
     return " ".join(name.split()) or None
@@ -126,22 +138,6 @@ def _linux_name() -> str:
         names = re.findall(rf"^{key}[ \t]*:[ \t]*(\S.*)$", text, re.MULTILINE)
         if names:
             return prefix + ", ".join(dict.fromkeys(map(str.strip, names)))
-    return ""
-
-
-def _macos_name() -> str:
-    command = ["/usr/sbin/sysctl", "-n", "machdep.cpu.brand_string"]
-    return subprocess.run(  # noqa: S603
-        command, capture_output=True, encoding="utf-8", timeout=5, check=True
-    ).stdout
-
-
-def _windows_name() -> str:
-    if sys.platform == "win32":
-        import winreg
-
-        with winreg.OpenKey(winreg.HKEY_LOCAL_MACHINE, WINDOWS_KEY) as key:
-            return str(winreg.QueryValueEx(key, "ProcessorNameString")[0])
     return ""
 
 

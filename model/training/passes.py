@@ -179,7 +179,14 @@ def transfer_of(
     fx = across[None]
     radius = torch.hypot(fy, fx)
     if isinstance(blur, MtfTable):
-        gamma_x, gamma_y = _table_gammas(blur, radius)
+        # Gamma is interpolated at each radius, as `MtfTable.at` does. The last radius has no
+        # neighbour on its right.
+        evenly = np.linspace(blur.frequency[1], blur.frequency[-1], GAMMAS)
+        scale = (GAMMAS - 1) / (evenly[-1] - evenly[0])
+        place = (radius.clamp(evenly[0], evenly[-1]) - evenly[0]) * scale
+        left = place.int().clamp(max=GAMMAS - 2)
+        tables = (torch.tensor(v, dtype=torch.float32).to(device) for v in blur.gammas(evenly))
+        gamma_x, gamma_y = (torch.lerp(v[left], v[left + 1], place - left) for v in tables)
         loss = torch.hypot(gamma_x * fx, gamma_y * fy)
     else:
         axes = blur if isinstance(blur, tuple) else (blur, blur)
@@ -190,22 +197,6 @@ def transfer_of(
     upper = torch.exp(-loss) * torch.sinc(fx) * (torch.sinc(fy) * torch.sinc(smear_px * fy))
     # The transfer is even in fy: the rows below mirror those above.
     return torch.cat([upper, upper[1 : (height + 1) // 2].flip(0)])
-
-
-def _table_gammas(table: MtfTable, radius: Tensor) -> list[Tensor]:
-    """Interpolate gamma across and along the track at each radius, as `MtfTable.at` does."""
-    evenly = np.linspace(table.frequency[1], table.frequency[-1], GAMMAS)
-    place = (radius.clamp(evenly[0], evenly[-1]) - evenly[0]) * (
-        (GAMMAS - 1) / (evenly[-1] - evenly[0])
-    )
-    # The last radius has no neighbour on its right.
-    left = place.int().clamp(max=GAMMAS - 2)
-    share = place - left
-    gammas = []
-    for values in table.gammas(evenly):
-        gamma = torch.tensor(values, dtype=torch.float32).to(radius.device)
-        gammas.append(torch.lerp(gamma[left], gamma[left + 1], share))
-    return gammas
 
 
 def detected(
