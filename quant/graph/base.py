@@ -41,7 +41,7 @@ class Base:
             places = np.zeros(self.factor)
         distances = np.abs(np.arange(-REACH_PX, REACH_PX + 1) - places[:, None])
         if self.mode != "cubic":
-            return np.maximum(1 - distances, 0).astype(np.float32)
+            return np.asarray(np.maximum(1 - distances, 0), np.float32)
         # R. Keys, "Cubic convolution interpolation for digital image processing", IEEE TASSP 1981.
         near = (CUBIC + 2) * distances**3 - (CUBIC + 3) * distances**2 + 1
         far = CUBIC * (distances**3 - 5 * distances**2 + 8 * distances - 4)

@@ -99,9 +99,10 @@ def _crop_px(graph: OnnxGraph, result: str) -> int:
     node = graph.sole_writer(result)
     if node is None or node.op_type != "Slice":
         return 0
-    starts, stops, axes = (graph.numbers(node, place, "") for place in (1, 2, 3))
-    is_crop = starts and axes == [2, 3] and starts == [starts[0]] * 2
-    return int(starts[0]) if is_crop and stops == [-starts[0]] * 2 else 0
+    starts, stops, axes = (graph.numbers(node, place, "") or [0] for place in (1, 2, 3))
+    crop_px = int(starts[0])
+    is_crop = axes == [2, 3] and starts == [crop_px] * 2 and stops == [-crop_px] * 2
+    return crop_px if is_crop else 0
 
 
 def _limits(graph: OnnxGraph, result: str, limits: tuple[float, ...]) -> tuple[float, ...]:

@@ -319,8 +319,8 @@ class HostPart:
         if self.unit != 1:
             result = w.node("Mul", "host_back.in_units", [result, w.scalar("unit", self.unit)])
         if self.crop_px:
-            ends = [self.crop_px] * 2, [-self.crop_px] * 2, [2, 3]
-            places = [w.constant(f"crop_{k}", np.array(end)) for k, end in enumerate(ends)]
+            crop = [self.crop_px] * 2, [-self.crop_px] * 2, [2, 3]
+            places = [w.constant(f"crop_{k}", np.array(side)) for k, side in enumerate(crop)]
             result = w.node("Slice", "host_back.cropped", [result, *places])
         if self.adds_image:
             base = write_base(w, self.base, IMAGE)
