@@ -6,16 +6,19 @@ even ground has no measurable noise. In these cases nothing is contradicted.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from beers_deploy.model.metrics.edge_blur import AxisMtf
-from beers_deploy.model.metrics.instrument import AXES, snr
+from beers_deploy.model.metrics.instrument import AXES, axis_mtfs, snr
 from beers_deploy.model.metrics.noise_blocks import ROUNDING, Blocks
 from beers_deploy.model.metrics.noise_line import SEED, NoiseModel
 from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.model.metrics.slanted_edge import slanted_edge
+from beers_deploy.model.simulator.acquire import NOISE, acquire, prepare_scene
+from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.profiles.figures import Figure, measured, unavailable
 from beers_deploy.profiles.instrument import Instrument
@@ -33,6 +36,11 @@ QUIET_PERCENT = 10.0
 stated variance of the noise.
 
 By chance the quietest blocks have 0.6 of it.
+"""
+EDGE_PX = 80
+OVERSAMPLING = 4
+"""The side of the part of a simulated edge that is measured, and the number of scene pixels along
+a pixel.
 """
 FILTERED = ": restored, resampled or compressed before, or of another gain"
 SNR = "measured SNR"
@@ -54,10 +62,13 @@ class StatedSensor(NamedTuple):
         instruments: the nominal sensor first, then sensors drawn from the profile's ranges; the
             nominal one alone if the profile states no ranges.
         unit: the pixel value of one digital number of the sensor.
+        edge_mtf: the MTF at Nyquist that edges show behind a whole MTF or a point-spread function,
+            for each axis; empty if the profile states contrasts at Nyquist alone.
     """
 
     instruments: Sequence[Instrument]
     unit: float
+    edge_mtf: Mapping[str, float] = {}
 
     @classmethod
     def of(cls, sensor: Sensor, clipped_at: float) -> "StatedSensor":
@@ -71,7 +82,8 @@ class StatedSensor(NamedTuple):
         nominal = sensor.nominal()
         samples = (sensor.draw(generator) for _ in range(DRAWS))
         others = (sample for sample in samples if sample != nominal)
-        return cls([nominal, *others], clipped_at / nominal.max_dn)
+        edge_mtf = {} if nominal.response is None else edge_mtf_of(nominal)
+        return cls([nominal, *others], clipped_at / nominal.max_dn, edge_mtf)
 
     def variances(self, value: np.ndarray | float) -> np.ndarray:
         """Return the variance of the noise of each instrument, without that of rounding.
@@ -125,6 +137,26 @@ class StatedSensor(NamedTuple):
             abs(complex(sensor_mtf(fx, fy, instrument).item())) for instrument in self.instruments
         ]
         return min(contrasts), max(contrasts)
+
+
+def edge_mtf_of(sensor: Instrument) -> dict[str, float]:
+    """Measure the MTF at Nyquist on a simulated edge across each axis, as in an image.
+
+    A fit of 17 x 17 pixels cannot show the far tails of a blur: with 30 % of the light in a halo of
+    4 px, a contrast of 6 % looks like 2.2 % (measured).
+
+    Args:
+        sensor: the instrument; it is simulated without noise.
+    """
+    full_scale = sensor.max_dn / sensor.gain_dn_per_radiance
+    scene = slanted_edge(3 * EDGE_PX, OVERSAMPLING, 5, (full_scale / 10, full_scale / 2))
+    skip = (*NOISE, *sensor.effects)
+    windows = [
+        acquire(prepare_scene(each, OVERSAMPLING), sensor, Draw(0), margin_px=EDGE_PX, skip=skip)
+        for each in (scene, scene.T)
+    ]
+    blurs = axis_mtfs(windows, StatedSensor([sensor], 1).nominal_noise, sensor.max_dn)
+    return {axis: blur.mtf_nyquist for axis, blur in blurs.items() if isinstance(blur, AxisMtf)}
 
 
 def compare_noise(
@@ -198,11 +230,12 @@ def compare_blur(
     low, high = blur.interval
     figure = measured(100 * blur.mtf_nyquist, "%", f"{blur.edges} edges", (100 * low, 100 * high))
     least, most = stated.mtf(axis)
+    on_edge = stated.edge_mtf.get(axis, least)
     # Few and soft edges do not show the shape of the curve, so the MTF by the profile's own shape
     # must be off as well.
     if (
-        min(low, blur.nearest) <= most * BLUR_FACTOR
-        and max(high, blur.nearest) >= least / BLUR_FACTOR
+        min(low, blur.nearest) <= max(most, on_edge) * BLUR_FACTOR
+        and max(high, blur.nearest) >= min(least, on_edge) / BLUR_FACTOR
     ):
         return figure, []
     bound = most if low > most else least

@@ -10,6 +10,7 @@ import tifffile
 
 import beers_deploy as bd
 from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.response import PointSpread, packed
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.sensor_check.check import SensorCheck, check_source
 from tests.deploy.command_line import done, refused
@@ -65,6 +66,27 @@ def test_another_sensor_is_recognised(
 ) -> None:
     (warning, *_) = check(raw, SENSOR.replace(**numbers)).warnings
     assert re.search(words, warning)
+
+
+def test_a_halo_that_the_profile_states_is_no_contradiction() -> None:
+    frequency = np.fft.fftfreq(161, 1 / 4)
+    down = frequency[:, None]
+    distance = np.hypot(down, frequency)
+    halo = np.exp(-2 * (4 * np.pi * distance) ** 2)
+    transfer = (0.7 * np.exp(-4 * distance) + 0.3 * halo) * np.sinc(down) * np.sinc(frequency)
+    samples = np.fft.fftshift(np.fft.ifft2(transfer).real)
+    response = PointSpread(161, 161, 4.0, packed(samples))
+    across, along = response.at_nyquist
+    sensor = SENSOR.with_fields(response=response, mtf_nyquist=across, mtf_nyquist_along=along)
+    pair = bd.simulate(sensor=sensor, size=320, seed=3)
+    assert isinstance(pair, bd.Pair)
+    result = check(pair.degraded, sensor)
+    assert result.warnings == ()
+    assert (result.figures["measured MTF across"].value or 0) < 3
+    sharper = SENSOR.replace(mtf_nyquist=0.14)
+    other = bd.simulate(sensor=sharper, size=320, seed=3)
+    assert isinstance(other, bd.Pair)
+    assert "MTF across" in "".join(check(other.degraded, sensor).warnings)
 
 
 def test_pixels_above_the_sensor_s_full_scale_contradict_it(raw: np.ndarray) -> None:
