@@ -16,6 +16,7 @@ import beers_deploy as bd
 from beers_deploy.kit.golden import (
     CASES,
     INDEX,
+    PICTURE,
     Golden,
     files_of,
     read_golden,
@@ -274,6 +275,14 @@ def test_damaged_vectors_of_any_layer_are_refused_and_absent_ones_are_computed(
     )
     last.unlink()
     assert compare_golden(copied, tmp_path / "seen")
+    # It has no digest, but its planes have one.
+    picture = copied / "noise" / PICTURE
+    image = np.load(picture)
+    for damaged in (1 - image, image[0], np.full_like(image, np.nan)):
+        np.save(picture, damaged)
+        assert f"noise/{PICTURE} has other numbers" in refused(
+            "golden", tmp_path / "seen", "--compare", copied
+        )
 
 
 def test_older_vectors_do_not_stay(copied: Path) -> None:
