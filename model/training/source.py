@@ -18,7 +18,7 @@ from torch import Tensor
 from beers_deploy.model.bank import Bank, network_bank
 from beers_deploy.model.convbeers import Condition, vector_tensor
 from beers_deploy.model.exposure import HEADROOM, factors_for
-from beers_deploy.model.raster.images import read_acquisition
+from beers_deploy.model.raster.images import image_size_px, read_acquisition
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.training.passes import (
@@ -240,6 +240,18 @@ class StoredPairs:
     quarters: bool = True
     mirrors: bool = True
 
+    def __post_init__(self) -> None:
+        # A step may come late at a pair, so all headers are read before the first one.
+        for files in self.files:
+            degraded, reference = map(image_size_px, files)
+            if degraded != reference or min(degraded) < self.patch_px:
+                px = " and ".join(f"{w} x {h} pixels" for h, w in (degraded, reference))
+                raise ImageError(
+                    f"{files[0]} and its reference must be mono images of one size, "
+                    f"{self.patch_px} pixels a side or more, but they have {px}. Choose a "
+                    "smaller `patch`, or simulate larger patches."
+                )
+
     def batches(self, first: int = 0) -> Iterator[Batch]:
         """Yield batch number `first` and all that follow."""
         number = first
@@ -254,15 +266,7 @@ class StoredPairs:
         """Read one patch (2, P, P) at a random place of a random pair."""
         files = self.files[int(generator.integers(len(self.files)))]
         images = [read_acquisition(file, remedy=RESCALE, max_dn=self.max_dn) for file in files]
-        height, width = images[0].shape
-        if images[0].shape != images[1].shape or min(height, width) < self.patch_px:
-            sizes = " and ".join(f"{image.shape[1]} x {image.shape[0]} pixels" for image in images)
-            raise ImageError(
-                f"{files[0]} and its reference must be mono images of one size, "
-                f"{self.patch_px} pixels a side or more, but they have {sizes}. Choose a smaller "
-                "`patch`, or simulate larger patches."
-            )
-        top, left = (int(generator.integers(size - self.patch_px + 1)) for size in (height, width))
+        top, left = (int(generator.integers(px - self.patch_px + 1)) for px in images[0].shape)
         window = slice(top, top + self.patch_px), slice(left, left + self.patch_px)
         both = np.stack([np.float32(image[window]) for image in images])
         patches = turn(both, generator, self.quarters, self.mirrors)

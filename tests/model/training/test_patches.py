@@ -262,9 +262,12 @@ def test_stored_pairs_of_another_scale_are_refused(
 
 
 def test_stored_pairs_too_small_or_incomplete_are_refused(tmp_path: Path) -> None:
-    pairs = replace(write_pairs(tmp_path), patch_px=42)
+    pairs = write_pairs(tmp_path)
     with pytest.raises(ImageError, match="42 pixels"):
-        next(pairs.batches())
+        replace(pairs, patch_px=42)
+    write_tiff(tmp_path / "degraded" / "p2.tif", np.ones((30, 53), np.uint16))
+    with pytest.raises(ImageError, match=r"p2.tif .* 53 x 30 pixels and 53 x 41 pixels"):
+        replace(pairs, seed=1)
     (tmp_path / "degraded" / "p1.tif").unlink()
     with pytest.raises(ImageError, match="'p1' in only one"):
         pair_files(tmp_path)
