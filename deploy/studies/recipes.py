@@ -22,7 +22,7 @@ from beers_deploy.model.raster.images import list_images, site_of
 from beers_deploy.model.shipped import INT8, SENSOR, shipped_weights
 from beers_deploy.model.training.checkpoint import TrainingRecipe
 from beers_deploy.model.training.patches import PatchRecipe
-from beers_deploy.model.training.recipe import NetworkRecipe, Stage
+from beers_deploy.model.training.recipe import RECIPES, NetworkRecipe, Stage
 from beers_deploy.model.training.run import Run, train
 from beers_deploy.model.training.trainer import Worker
 from beers_deploy.model.variants import VARIANTS, Variant
@@ -36,9 +36,8 @@ logger = logging.getLogger(__name__)
 
 
 def make_network(
-    name: str,
+    path: Path,
     recipe: NetworkRecipe,
-    toml: str,
     images: Sequence[Path],
     out: Path,
     resume: bool,
@@ -47,9 +46,8 @@ def make_network(
     """Train a network by its recipe, and write its weights, its INT8 file and its model card.
 
     Args:
-        name: the name of the network, for its files and its model card.
+        path: the recipe's file, whose stem is the name of the network.
         recipe: all parameters of the training, in one or several stages.
-        toml: the text of the recipe's file, for the model card.
         images: folders of photographs to train on.
         out: the output folder, with a folder for each stage.
         resume: True to continue the run in the folder; otherwise it must contain no run.
@@ -59,10 +57,14 @@ def make_network(
         OptionError: the folder contains a run, or one that cannot be continued with this recipe.
         ModelError: the training diverges, or weights do not fit the recipe.
     """
+    name = path.stem
+    toml = path.read_text(encoding="utf-8")
+    label = name if path.parent == RECIPES else path.name
     weights = shipped_weights(recipe.start) if recipe.start else None
     for number, stage in enumerate(recipe.stages, 1):
         run = stage_run(recipe, number, stage, images, out, weights, device)
-        goes_on = resume and run.checkpoint.exists()
+        # A later stage may not have begun, but without a first one there is nothing to continue.
+        goes_on = resume and (number == 1 or run.checkpoint.exists())
         train(run, goes_on, Worker())
         weights = run.weights
         logger.info("stage %d of %d, %s: wrote %s", number, len(recipe.stages), stage.name, weights)
@@ -73,9 +75,9 @@ def make_network(
     save_onnx(family_model(Conditioned(name, finished), images), int8)
     card = out / f"{name}.md"
     with whole_file(card) as temporary:
-        temporary.write_text(model_card(name, recipe, toml, images), encoding="utf-8")
-    for path in (finished, int8, card):
-        logger.info("wrote %s", path)
+        temporary.write_text(model_card(label, recipe, toml, images), encoding="utf-8")
+    for file in (finished, int8, card):
+        logger.info("wrote %s", file)
 
 
 def stage_run(
@@ -146,12 +148,12 @@ def stage_run(
     )
 
 
-def model_card(name: str, recipe: NetworkRecipe, toml: str, images: Sequence[Path]) -> str:
+def model_card(label: str, recipe: NetworkRecipe, toml: str, images: Sequence[Path]) -> str:
     """Return the Markdown text of the model card of a trained network, which states its recipe, its
     data, and the machine that trained it.
 
     Args:
-        name: the name of the network.
+        label: the recipe's name if it is shipped, or the name of its file.
         recipe: the recipe of the network.
         toml: the text of the recipe's file, which the card quotes.
         images: folders of the photographs that it was trained on; their names and content enter a
@@ -167,6 +169,7 @@ def model_card(name: str, recipe: NetworkRecipe, toml: str, images: Sequence[Pat
     attribution = "".join(f"- {line}\n" for line in recipe.attribution)
     notes = "".join(f"{line}\n\n" for line in recipe.notes)
     patches = sum(stage.steps * stage.batch for stage in recipe.stages)
+    name = label.removesuffix(".toml")
     folders = " ".join(f"--images {folder.resolve().name}/" for folder in images)
     return f"""# {name}
 
@@ -175,7 +178,7 @@ every sensor in range.
 
 **Made by**
 
-    beers-deploy train --recipe {name} {folders} --out runs/{name}
+    beers-deploy train --recipe {label} {folders} --out runs/{name}
 
 on {processor_name()} with PyTorch {torch.__version__}: {patches} patches of {len(photos)} \
 photographs, whose list of names and digests has the SHA-256 `{data[:16]}`, and {recipe.charts} \

@@ -37,7 +37,7 @@ BESIDE_RECIPE = {"out", "recipe", "images", "device", "resume", "progress"}
 def train(
     *,
     out: Annotated[OutputFolder, Holds(*FILES, folders=("",))],
-    recipe: str | None = None,
+    recipe: InputPath | None = None,
     images: InputPaths = (),
     pairs: InputPath | None = None,
     variant: str = "convbeers-s",
@@ -120,7 +120,7 @@ def train(
     if recipe is not None:
         stated = [name for name in signature(train).parameters if name not in BESIDE_RECIPE]
         refuse_with("`recipe`, which states it", **options(*stated))
-        return _make(recipe, folders, Path(out), resume, device)
+        return _make(os.fspath(recipe), folders, Path(out), resume, device)
     if pairs is not None:
         refuse_with("`pairs`", images=bool(folders), **options("drawn", "conditioned"))
     if rounding is not None and not (conditioned and start):
@@ -209,6 +209,5 @@ def _make(name: str, images: Sequence[Path], out: Path, resume: bool, device: st
     path = recipe_file(name)
     outputs = [out / f"{path.stem}{end}" for end in (".safetensors", f"{INT8}.onnx", ".md")]
     require_writable(*outputs, inputs=images)
-    toml = path.read_text(encoding="utf-8")
-    make_network(path.stem, recipe, toml, images, out, resume, device)
+    make_network(path, recipe, images, out, resume, device)
     return outputs[0]

@@ -62,6 +62,7 @@ def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes
     recipe.write_text(RECIPE)
     images = "--images", folders[0], "--images", folders[1]
     command = "train", "--recipe", recipe, *images, "--out", out
+    assert "--resume has no run to continue" in refused(*command, "--resume")
     done(*command)
     names = [f"own{end}" for end in (".safetensors", "-int8.onnx", ".md")]
     first = [(out / name).read_bytes() for name in names]
@@ -72,6 +73,7 @@ def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes
     assert RECIPE.strip() in card
     assert "- Drawn for a test, CC0 1.0" in card
     assert "10 patches of 1 photographs" in card
+    assert "train --recipe own.toml --images" in card
     assert f"--images {folders[0].name}/ --images {folders[1].name}/ --out" in card
     trained = read_tensors(out / "1-float" / "convbeers-half-xs.safetensors")[1]["recipe"]
     assert isinstance(trained, dict)
