@@ -57,8 +57,10 @@ def check_memory(rows: int, budget_bytes: int | None) -> int:
         MachineError: the peak exceeds the memory that is allowed.
     """
     resident_bytes = psutil.Process().memory_info().rss
-    # What this process holds already is not part of what is free.
-    allowed_bytes = budget_bytes or psutil.virtual_memory().available + resident_bytes
+    allowed_bytes = budget_bytes
+    if allowed_bytes is None:
+        # What this process holds already is not part of what is free.
+        allowed_bytes = psutil.virtual_memory().available + resident_bytes
     if resident_bytes + rows <= allowed_bytes:
         return resident_bytes + rows
     limit, before, rows_size = sizes(allowed_bytes, resident_bytes, rows)

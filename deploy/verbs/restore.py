@@ -170,7 +170,7 @@ def restore(
         strict=strict,
         force=force,
         # A budget of 0 bytes would count as none.
-        memory_bytes=None if memory is None else max(int(min(memory * 1e9, sys.maxsize)), 1),
+        memory_bytes=None if memory is None else int(min(memory * 1e9, sys.maxsize)),
         fix_detectors=fix_detectors or "",
     )
     engine = Engine(runtime, threads, scheduler)
