@@ -1,4 +1,3 @@
-from .comparison import compare as compare
 from .kit.board import Board as Board
 from .network import Network as Network
 from .pairs import Pair as Pair
@@ -12,6 +11,7 @@ from .shipped_tables import sensors as sensors
 from .verbs.bench import bench as bench
 from .verbs.characterize import characterize as characterize
 from .verbs.check import check as check
+from .verbs.compare import compare as compare
 from .verbs.demo import demo as demo
 from .verbs.evaluate import evaluate as evaluate
 from .verbs.export import export as export

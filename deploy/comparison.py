@@ -10,18 +10,16 @@ from typing import TYPE_CHECKING
 
 from beers_deploy.conditioned_file import conditioned_on
 from beers_deploy.model.io.files import IMAGE_SUFFIXES, sha256
-from beers_deploy.model.progress import Progress, reporting
 from beers_deploy.model.raster.images import list_images
-from beers_deploy.model.shipped import INT8, SENSOR, VARIANT, shipped_weights
+from beers_deploy.model.shipped import INT8, VARIANT, shipped_weights
 from beers_deploy.network import Network, NetworkLike
-from beers_deploy.profiles.errors import ImageError, OptionError, printable
-from beers_deploy.profiles.sensor import Sensor, SensorLike
+from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_numbers import numbers_of
 from beers_deploy.quant.encodings import CORE
 from beers_deploy.quant.gate import GateResult, gate_row
 from beers_deploy.quant.gate import compare as differences_of
 from beers_deploy.quant.input_range import UNIT
-from beers_deploy.quant.metrics import METRICS
 from beers_deploy.quant.onnx_file import faults_named, metadata, require_quantized
 from beers_deploy.quant.samples.coverage import recorded_range, uncovered
 from beers_deploy.quant.samples.own import (
@@ -190,72 +188,11 @@ class Comparison(Table):
     rests_on: tuple[Input, ...]
 
 
-def compare(
-    float_network: NetworkLike | None = None,
-    int8_network: NetworkLike | None = None,
-    *,
-    samples: object = None,
-    sensor: SensorLike = SENSOR,
-    images: str | os.PathLike[str] | None = None,
-    patches: int = 32,
-    seed: int = 0,
-    metric: str | None = None,
-    output: str | None = None,
-    progress: Progress = None,
-) -> Comparison:
-    """Compare a float and an INT8 network on samples that were not used for calibration.
-
-    Args:
-        float_network: the float network. The name of a shipped network, or the `Network` that
-            `quantize` returned, stands for both networks; None for the shipped convbeers-s.
-        int8_network: the INT8 network that was made from it; None if `float_network` stands for
-            both.
-        samples: a path, arrays or any input that `quantize` accepts; simulated patches if None.
-        sensor: the sensor whose images the patches imitate and that shipped networks are
-            conditioned on.
-        images: folder of scenes to simulate the patches from; None for scenes drawn at random.
-        patches: number of simulated patches, 128 x 128 pixels each.
-        seed: the seed of the patches.
-        metric: psnr, ssim or mae, to also compare each network's results with the references; None
-            for no comparison with them.
-        output: name of the output to compare, if a network has several.
-        progress: a function that is called at each step, False for silence, None for a bar or lines
-            on standard error.
-
-    Returns:
-        A table of the differences. It has no checks: `gate` adds limits.
-
-    Raises:
-        ModelError: a file is not a valid network of the expected kind.
-        OptionError: there is no INT8 network, the metric is unknown, or images are given together
-            with samples.
-        ImageError: the networks do not accept the samples.
-
-    Examples:
-        >>> table = bd.compare("convbeers-xs", patches=2)
-        >>> bool(table.rows[0].figures["MAE"].value < 0.001)  # of full scale
-        True
-    """
-    profile = Sensor.load(sensor)
-    if samples is not None and images is not None:
-        raise OptionError(
-            f"`images` ({images}) cannot be combined with `samples`, because images are for "
-            "simulated patches. Leave one of them out."
-        )
-    if metric not in (None, *METRICS):
-        raise OptionError(
-            f"`metric` must be one of {', '.join(METRICS)}, but it is {printable(repr(metric))}."
-        )
-    floating, int8 = pair_of(float_network, int8_network, profile, output)
-    data = Data(profile, samples, None if images is None else Path(images), patches, seed)
-    with reporting(progress):
-        return compared(floating, int8, data, data.own(floating, int8), metric or "")
-
-
 def compared(
     floating: Network, int8: Network, data: Data, own: OwnSamples | None, metric: str
 ) -> Comparison:
-    """Run both networks on the same data, and measure their differences; the work of `compare`.
+    """Run both networks on the same data, and measure their differences: the work of
+    `compare` and `gate`.
 
     Args:
         floating: the float network.

@@ -9,7 +9,7 @@ import pytest
 
 import beers_deploy as bd
 from beers_deploy.comparison import Data, sensor_input
-from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.quant.samples.own import CALIBRATED_ON, digest_of
@@ -58,6 +58,13 @@ def test_the_judged_file_does_not_choose_its_samples(model: Path) -> None:
     second = bd.compare(replace(int8, model=model_with_claim), samples=mixed)
     assert (second.result.mae, second.result.patches) == (comparison.result.mae, 7)
     assert "7 of the 7 samples" in second.notes[0]
+
+
+def test_numbers_of_another_type_are_refused_in_a_sentence() -> None:
+    for wrong in ({"patches": "1"}, {"seed": "1"}, {"metric": ["psnr"]}):
+        (name,) = wrong
+        with pytest.raises(OptionError, match=f"`{name}` must be"):
+            bd.compare("convbeers-xs", **wrong)
 
 
 def test_samples_without_contrast_are_not_judged() -> None:
