@@ -106,6 +106,9 @@ def require_allowed(parameter: Parameter, value: object) -> None:
 
 def _require_text(name: str, value: object, parts: list[Any]) -> None:
     """Raise OptionError if a text or a path, or one of several, has another type."""
+    # Standard output is for the results document.
+    if any(isinstance(part, Written) for part in parts) and str(value) == "-":
+        raise OptionError(f"`{name}` must be a path, got '-'. Name the file or folder to write.")
     wider = next((part for part in parts if isinstance(part, Wider)), None)
     if (wider and not wider.names) or not {str, Path}.intersection(parts):
         return

@@ -182,6 +182,12 @@ def test_only_a_regular_file_is_written_over(
     refused(command_with(name, tmp_path, **{option: value}), tmp_path, str(file), word)
 
 
+@pytest.mark.parametrize(("name", "option"), [pair for pair in WRITERS if pair[1] != JSON])
+def test_standard_output_is_for_results_alone(name: str, option: str, tmp_path: Path) -> None:
+    command = command_with(name, tmp_path, **{option: Path("-")})
+    refused(command, tmp_path, "must be a path, got '-'")
+
+
 @pytest.mark.parametrize(
     ("name", "option", "make"), in_turn(FOLDERS, [existing, pipe, device, dangling])
 )
