@@ -148,8 +148,11 @@ def samples_of(
     """
     channels = int(model.graph.input[0].type.tensor_type.shape.dim[1].dim_value) or 1
     fixed_px = fixed_tile_px(model)
+    min_side_px = 1
     try:
-        multiple_px = tiling_of(model).alignment_px
+        tiling = tiling_of(model)
+        multiple_px = tiling.alignment_px
+        min_side_px = tiling.whole_px(1)
     except ModelError:
         multiple_px = 0
     if samples is not None:
@@ -158,7 +161,7 @@ def samples_of(
         else:
             source = samples_in(samples)
         ranges = None if input_range is None else read_ranges(input_range, channels)
-        return read_samples(source, channels, fixed_px, multiple_px or 1, ranges)
+        return read_samples(source, channels, fixed_px, multiple_px or 1, ranges, min_side_px)
     # Simulated patches have one channel and PATCH_PX a side.
     if fixed_px is not None and not multiple_px:
         what = f"only images of {fixed_px} x {fixed_px} pixels"
@@ -181,6 +184,7 @@ def read_samples(
     fixed_px: int | None,
     multiple_px: int = 1,
     ranges: Ranges | None = None,
+    min_side_px: int = 1,
 ) -> OwnSamples:
     """Read samples from a file, a folder or arrays, and cut them to a size that the network
     accepts.
@@ -193,6 +197,7 @@ def read_samples(
         multiple_px: sides are cut to multiples of this number of pixels.
         ranges: the ranges that the values must be in, and onto which pixels of image files are
             mapped; None determines them from the samples.
+        min_side_px: the shortest side that the network accepts.
 
     Returns:
         The samples, (1, C, h, w) float32 each.
@@ -207,6 +212,7 @@ def read_samples(
         label = str(source)
         name = source.name
     samples = list[Named]()
+    min_side_px = fixed_px or max(min_side_px, multiple_px)
     for sample, image, reference in stored_samples(source, ranges or ()):
         pixels = _valid_image(sample, image, channels, ranges)
         # Whether it must be an image in [0, 1] of the result's size depends on the measurement:
@@ -217,6 +223,11 @@ def read_samples(
                 f"{REMEDY}"
             )
         target = _finite(f"The reference of {sample}", reference)
+        if min(image.shape[1:]) < min_side_px:
+            raise ImageError(
+                f"{sample} must have at least {min_side_px} pixels a side, got "
+                f"{times(image.shape[1:])}. Give larger images."
+            )
         samples += [(sample, p) for p in _cut(pixels, target, sample, fixed_px, multiple_px)]
     if not samples:
         raise ImageError(f"{label} contains no sample, but at least one is needed. {REMEDY}")
@@ -299,11 +310,6 @@ def _cut(
     side = fixed_px or PATCH_PX // multiple_px * multiple_px
     # An image smaller than a patch is one patch, cut to the sides that the network takes.
     rows, columns = (side if n >= side else n // multiple_px * multiple_px for n in image.shape[1:])
-    if 0 in (rows, columns) or (fixed_px is not None and (rows, columns) != (side, side)):
-        raise ImageError(
-            f"{name} must have at least {fixed_px or multiple_px} pixels a side, got {size}. "
-            "Give larger images."
-        )
     for top in range(0, height - rows + 1, rows):
         for left in range(0, width - columns + 1, columns):
             patch = image[None, :, top : top + rows, left : left + columns]

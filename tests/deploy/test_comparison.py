@@ -67,6 +67,12 @@ def test_numbers_of_another_type_are_refused_in_a_sentence() -> None:
             bd.compare("convbeers-xs", **wrong)
 
 
+def test_samples_smaller_than_the_mirrored_border_are_refused() -> None:
+    samples = np.random.default_rng(0).random((4, 1, 2, 9), np.float32)
+    with pytest.raises(ImageError, match="at least 4 pixels a side, got 2 x 9"):
+        bd.compare("convbeers-xs", samples=samples)
+
+
 def test_samples_without_contrast_are_not_judged() -> None:
     samples = np.zeros((5, 1, 32, 40), np.float32)
     with pytest.raises(ImageError, match="contrast"):
