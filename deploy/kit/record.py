@@ -4,6 +4,7 @@ an ML-BOM.
 
 import hashlib
 import json
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -149,10 +150,24 @@ def _verified_weights(network: Network, sensor: Sensor, floating: Network | None
     return path if network.model.graph == shipped.graph else None
 
 
+def _texts(name: str, fact: object) -> Iterator[tuple[str, str]]:
+    """Yield each single fact in a document, with the keys that lead to it."""
+    parts = fact
+    if isinstance(fact, list) and any(isinstance(part, dict) for part in fact):
+        parts = dict(enumerate(fact, 1))
+    if isinstance(parts, dict):
+        for key, part in parts.items():
+            yield from _texts(f"{name} {key}".strip(), part)
+    elif isinstance(fact, list):
+        yield name, ", ".join(map(str, fact))
+    else:
+        yield name, "not known" if fact is None else str(fact)
+
+
 def _page(judged: Table, record: dict[str, Any]) -> Report:
     keys = ("weights_sha256", "training", "sensors_in_range", "licence")
     facts = record["network"] | {key: record[key] for key in keys}
-    rows = [Row("network", key, {}, {"value": str(value)}) for key, value in facts.items()]
+    rows = [Row("network", name, {}, {"value": text}) for name, text in _texts("", facts)]
     claims = [
         Row("claims", key, {}, {"claim": printable(value)}) for key, value in record["says"].items()
     ]

@@ -80,6 +80,11 @@ def test_claims_of_weights_are_verified(
     verdict = bd.gate(Network.load(pair[0]), int8, patches=1)
     assert record_of(verdict, int8, sensor)["weights_sha256"] == digest
     assert record_of(verdict, int8, sensor, Network.load(pair[0]))["training"] is not None
+    write_record(verdict, int8, sensor, tmp_path)
+    page = (tmp_path / "record.html").read_text()
+    assert "training patch_px</td>" in page
+    # No dictionary as Python writes it.
+    assert "{&#39;" not in page
     other = onnx.ModelProto.FromString(int8.model.SerializeToString())
     if claim == "weights":
         node = next(
