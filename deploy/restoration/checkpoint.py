@@ -93,7 +93,7 @@ class Checkpoint:
         dtype: np.dtype[Any],
         job: Mapping[str, object],
         resume: bool,
-        cog_bytes: int = 0,
+        more_bytes: int = 0,
         row_ends: Sequence[int] = (),
     ) -> None:
         """Start a checkpoint, or continue the one of an earlier run.
@@ -105,7 +105,7 @@ class Checkpoint:
             job: all parameters that determine the pixels, by name; a run is resumed only by one of
                 the same job.
             resume: True to continue an earlier run, and to start if there is none.
-            cog_bytes: disk space that the output needs in addition to the rows and the plain TIFF.
+            more_bytes: disk space that outputs need in addition to the rows and the plain TIFF.
             row_ends: the row of pixels at which each row of tiles ends; a journal of other rows is
                 refused. Empty accepts any rows.
 
@@ -132,7 +132,7 @@ class Checkpoint:
             # Outputs that a stop left half-written take room that this run needs.
             self._remove_outputs()
             out.parent.mkdir(parents=True, exist_ok=True)
-            self._require_room(cog_bytes)
+            self._require_room(more_bytes)
             self.folder.mkdir(exist_ok=True)
             (self.folder / "rows.raw").touch()
 
@@ -259,11 +259,11 @@ class Checkpoint:
         for path in self.folder.glob(f"{COG}*"):
             path.unlink()
 
-    def _require_room(self, cog_bytes: int) -> None:
+    def _require_room(self, more_bytes: int) -> None:
         bands, height, width = self.shape
         rows_bytes = bands * (height - self.rows) * width * self.dtype.itemsize
         # How well the pixels pack is not known yet, so nothing is assumed to be packed.
-        needed = rows_bytes + padded_px(self.shape) * self.dtype.itemsize + cog_bytes
+        needed = rows_bytes + padded_px(self.shape) * self.dtype.itemsize + more_bytes
         free = shutil.disk_usage(self.out.parent).free
         if needed > free:
             needed_size, free_size = sizes(needed, free)

@@ -23,7 +23,7 @@ from beers_deploy.model.progress import held_back, steps
 from beers_deploy.model.raster.facts import require_raw
 from beers_deploy.model.raster.reader import open_raster, require_image_file
 from beers_deploy.model.raster.source import Source, fingerprint, stamps
-from beers_deploy.model.raster.writer import cog_bytes, require_codec
+from beers_deploy.model.raster.writer import cog_bytes, padded_px, require_codec
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import BeersError, ImageError, MachineError, OptionError
 from beers_deploy.profiles.figures import Figure, Row, measured
@@ -39,7 +39,7 @@ from beers_deploy.restoration.interval import (
     interval_beside,
     write_half_widths,
 )
-from beers_deploy.restoration.memory import peak_memory
+from beers_deploy.restoration.memory import FLOAT_BYTES, peak_memory
 from beers_deploy.restoration.output import Output, require_tiff_name, what_was_done, write_output
 from beers_deploy.restoration.prepare import Pipeline, Restoration
 from beers_deploy.restoration.radiometry import Reading
@@ -248,6 +248,9 @@ def _checkpoint(output: Output, work: Restoration, faults: FaultList) -> Checkpo
         **work.identity,
     }
     needed = cog_bytes(work.out_shape, raster.out_dtype.itemsize) if output.cog else 0
+    if output.interval is not None:
+        # Half-widths are written as float32, before the rows are removed.
+        needed += padded_px(raster.shape) * FLOAT_BYTES
     checkpoint = Checkpoint(
         output.path, work.out_shape, raster.out_dtype, job, output.resume, needed, work.row_ends
     )

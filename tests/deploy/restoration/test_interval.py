@@ -1,6 +1,7 @@
 """Tests of `restore --interval`: half-widths of files and arrays, and refused inputs."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from beers_deploy.model.io.tensors import read_weights
 from beers_deploy.model.shipped import shipped_names, shipped_weights
 from beers_deploy.model.variants import Variant
 from beers_deploy.network_files import int8_for_sensor
-from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.errors import MachineError, ModelError, OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.restoration.interval import interval_beside, interval_of
@@ -156,6 +157,19 @@ def test_a_network_without_an_interval_is_refused(image: Path, tmp_path: Path) -
     with pytest.raises(ModelError, match="has no calibrated interval"):
         run(image, tmp_path / "out.tif", network=path)
     assert names(tmp_path) == ["mine.onnx"]
+
+
+def test_the_space_for_the_half_widths_is_checked_before_the_run(
+    image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Two bands of 150 x 214: rows and tiles of 16 bits, and tiles of float32.
+    needed = 2 * (150 * 214 * 2 + 256**2 * (2 + 4))
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=needed - 1))
+    with pytest.raises(MachineError, match="disk space"):
+        run(image, tmp_path / "out.tif")
+    assert names(tmp_path) == []
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=needed))
+    assert run(image, tmp_path / "out.tif")
 
 
 @pytest.mark.parametrize("name", ["out-interval.tif", "blocks.tif", "page.html"])
