@@ -137,7 +137,9 @@ def evaluate(
             folder,
         )
     refuse_without("`detector`", **options("labels", "split", "side", "classes"))
-    if pairs is not None:
+    if pairs is None:
+        refuse_without("`pairs`", **options("strict"))
+    else:
         refuse_with("`pairs`", **options("images", "sweep", "brightness"))
     if images is not None:
         # An empty folder is refused before torch is loaded.

@@ -107,6 +107,7 @@ REFUSED = {
     "evaluate": [
         Refused(("images", "sweep", "brightness"), "--pairs PAIRS"),
         Refused(("labels", "split", "side", "classes"), without="--detector"),
+        Refused(("strict",), without="--pairs"),
         Refused(
             ("pairs", "calibrate", "sweep", "strict", "exposure", "bits_per_pixel"),
             "--detector DETECTOR",
