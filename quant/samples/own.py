@@ -215,14 +215,7 @@ def read_samples(
     min_side_px = fixed_px or max(min_side_px, multiple_px)
     for sample, image, reference in stored_samples(source, ranges or ()):
         pixels = _valid_image(sample, image, channels, ranges)
-        # Whether it must be an image in [0, 1] of the result's size depends on the measurement:
-        # `quant.gate.compare`.
-        if reference.dtype.kind not in "fuib":
-            raise ImageError(
-                f"The reference of {sample} must be of real numbers, got {reference.dtype}. "
-                f"{REMEDY}"
-            )
-        target = _finite(f"The reference of {sample}", reference)
+        target = _valid_reference(sample, reference)
         if min(image.shape[1:]) < min_side_px:
             raise ImageError(
                 f"{sample} must have at least {min_side_px} pixels a side, got "
@@ -265,6 +258,16 @@ def _finite(name: str, values: np.ndarray) -> np.ndarray:
             "pixels."
         )
     return finite
+
+
+def _valid_reference(sample: str, reference: np.ndarray) -> np.ndarray:
+    # Whether it must be an image in [0, 1] of the result's size depends on the measurement:
+    # `quant.gate.compare`.
+    if reference.dtype.kind not in "fuib":
+        raise ImageError(
+            f"The reference of {sample} must be of real numbers, got {reference.dtype}. {REMEDY}"
+        )
+    return _finite(f"The reference of {sample}", reference)
 
 
 def _valid_image(name: str, image: np.ndarray, channels: int, ranges: Ranges | None) -> np.ndarray:

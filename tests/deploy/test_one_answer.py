@@ -236,7 +236,6 @@ def test_unpadded_networks_of_a_fixed_size_get_one_answer(tmp_path: Path) -> Non
     ("sizes", "remedy"),
     [
         ([1, 1, "H", 32], "with free or with equal height and width"),
-        ([1, 1, 32, 48], "with free or with equal height and width"),
         ([4, 1, "H", "W"], "for one image, or for any number of them"),
         ([1, "C", "H", "W"], "with a fixed number of channels"),
     ],
