@@ -327,10 +327,15 @@ class Network:
         return str(self.path or self.name)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Network) and self.sha256 == other.sha256
+        return isinstance(other, Network) and self._identity == other._identity
 
     def __hash__(self) -> int:
-        return hash(self.sha256)
+        return hash(self._identity)
+
+    @property
+    def _identity(self) -> tuple[str, ...]:
+        # `with_output` makes several networks of one file.
+        return self.sha256, *(value.name for value in self.model.graph.output)
 
     def __getstate__(self) -> dict[str, object]:
         # A session of onnxruntime cannot be pickled; the copy opens one of its own.

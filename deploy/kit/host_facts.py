@@ -140,8 +140,8 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
 
 def _require_room(tile_px: int, tiling: Tiling) -> None:
     """Raise OptionError if `host.py` could not cut an image into tiles of this side."""
-    smallest_px = 2 * tiling.halo_px + tiling.alignment_px
     # Between two halos a tile must retain pixels, and it must begin where the strides repeat.
+    smallest_px = tiling.whole_px(2 * tiling.halo_px + tiling.alignment_px)
     if tile_px < smallest_px or tile_px % tiling.alignment_px:
         multiple = f"a multiple of {tiling.alignment_px} px and " if tiling.alignment_px > 1 else ""
         raise OptionError(

@@ -57,6 +57,8 @@ def test_a_network_with_one_output_computes_the_same(
     assert [value.name for value in graph.output] == [output]
     assert len(graph.node) < len(model.graph.node)
     np.testing.assert_allclose(kept(image), expected, atol=1e-5)
+    other = next(name for name in OUTPUTS if name != output)
+    assert kept != bd.Network.load(path).with_output(other)
 
 
 @pytest.mark.parametrize("output", OUTPUTS)
