@@ -190,6 +190,7 @@ def test_a_kit_has_the_expected_results_of_its_core(int8: bd.Network, tmp_path: 
     assert (folder / "measure.py").read_text(encoding="utf-8").startswith("#!/usr/bin/env python3")
 
 
+@pytest.mark.slow
 def test_a_pair_in_memory_is_evaluated_as_one_of_files(pair: bd.Pair, tmp_path: Path) -> None:
     degraded, reference = pair
     assert degraded.shape == reference.shape == pair.clean.shape == (70, 70)

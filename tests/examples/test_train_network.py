@@ -23,6 +23,7 @@ def test_a_few_steps_help_on_other_patches(name: str, scenes: list[Scene]) -> No
     assert trained[1:] == untrained[1:]
 
 
+@pytest.mark.slow
 def test_both_files_hold_the_trained_network(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

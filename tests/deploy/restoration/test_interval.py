@@ -78,6 +78,7 @@ def test_the_file_is_georeferenced_and_has_a_plane_for_each_band(
     assert_allclose(red[:, 150:], blue[:, 150:], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_tiles_and_stops_change_no_byte(image: Path, tmp_path: Path) -> None:
     whole = run(image, tmp_path / "whole.tif", tile=512)
     assert run(image, tmp_path / "tiles.tif", tile=64) == whole
