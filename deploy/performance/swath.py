@@ -9,7 +9,7 @@ from operator import mul
 
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.placement import place
-from beers_deploy.dpu.cost.host import Task
+from beers_deploy.dpu.cost.host import FloatWork, Task
 from beers_deploy.dpu.cost.latency import Prediction, dpu_power, predict
 from beers_deploy.dpu.cost.model import Interval, between
 from beers_deploy.dpu.reading import network_of
@@ -19,6 +19,8 @@ from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.figures import Figure, predicted, unavailable
 from beers_deploy.profiles.shipped import TILE_PX
+from beers_deploy.quant.encodings import CORE, read_core
+from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.restoration.plan import plan_side
 
 COST_SOURCE = "cost model fitted on published networks, docs/explanation/cost-model.md"
@@ -118,7 +120,18 @@ def predict_network(
     """
     source = Network.load(network, to_run=False)
     sized = network_of(source.model, tile_px, source.label)
-    return predict(place(sized, dpu), dpu, task, step_px)
+    return predict(place(sized, dpu), dpu, task, step_px, float_work(source))
+
+
+def float_work(network: Network) -> FloatWork:
+    """Return what the host computes in float of an INT8 network's results; nothing for a float
+    network, whose operators show it.
+    """
+    if CORE not in metadata(network.model):
+        return FloatWork()
+    part = read_core(network.model).host_part
+    kinds = (part.base.mode if part.base.factor > 1 else "", part.activation)
+    return FloatWork(tuple(filter(None, kinds)), part.decoding.copies)
 
 
 def swath_figures(

@@ -8,7 +8,7 @@ and of the consistency step follows from the processor's published rates as an i
 import math
 from collections.abc import Sequence
 from itertools import chain
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -187,6 +187,52 @@ def _plain_work_s(operations: float, moved_values: float, results: float, dpu: D
     instructions = INSTRUCTIONS * results + PRODUCT_INSTRUCTIONS * operations
     most_s = instructions / (1e6 * decoding.low * clock.low) + moved_bytes / bandwidth.low
     return least_s, most_s
+
+
+FLOAT_OPERATIONS = {"nearest": 1.0, "linear": 6.0, "cubic": 14.0, "Sigmoid": 20.0, "Tanh": 20.0}
+"""Operations of the host for a value that it enlarges, by the interpolation, or activates: the
+products of rows and columns and their sums, or a hyperbolic tangent (assumed).
+"""
+
+
+class FloatWork(NamedTuple):
+    """What the host computes in float of an INT8 network's results, and no rate is published for.
+
+    Attributes:
+        kinds: keys of FLOAT_OPERATIONS.
+        copies: the number of bytes that the DPU returns for each value.
+    """
+
+    kinds: tuple[str, ...] = ()
+    copies: int = 1
+
+
+def float_interval_s(placement: Placement, task: Task, work: FloatWork, dpu: Dpu) -> Interval:
+    """Estimate the time in which the host enlarges an image or activates a result in float.
+
+    Args:
+        placement: where each operation of the network runs. A float file has the operators in it.
+        task: what the host does with the results.
+        work: what the host does around an INT8 network.
+        dpu: the configuration, whose board states the processor.
+
+    Returns:
+        The shortest and the longest time in s, for one image on all cores together.
+    """
+    _, back = _crossing_bytes(placement)
+    values = dict.fromkeys(work.kinds, back / work.copies)
+    for node in placement.nodes:
+        if task == "image" and node.part != "dpu-core":
+            kind = node.op.op_type
+            if kind == "Resize":
+                kind = str(node.op.attributes.get("mode", "nearest"))
+            if kind in FLOAT_OPERATIONS:
+                values[kind] = values.get(kind, 0) + node.op.out_bytes
+    operations = sum(FLOAT_OPERATIONS[kind] * count for kind, count in values.items())
+    results = sum(values.values())
+    low_s, high_s = _plain_work_s(operations, 2 * results, results, dpu)
+    cores = dpu.whole("cpu", "cores")
+    return low_s / cores, high_s / cores
 
 
 def consistency_interval_s(pixels: float, dpu: Dpu) -> Interval:

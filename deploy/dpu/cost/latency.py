@@ -21,8 +21,10 @@ import numpy as np
 from beers_deploy.dpu.board import Dpu, Levels
 from beers_deploy.dpu.checker.placement import Placement
 from beers_deploy.dpu.cost.host import (
+    FloatWork,
     Task,
     consistency_interval_s,
+    float_interval_s,
     host_parts_s,
     placed_work,
     refused_interval_s,
@@ -94,7 +96,8 @@ class Prediction:
             empty if there are none.
         note: what was assumed of a float file; empty for a quantised one.
         refused: the names of the nodes that the DPU refuses and the host runs.
-        refused_s: shortest and longest time in s of these nodes for an image, a part of `host_s`.
+        refused_s: shortest and longest time in s of these nodes for an image, and of enlarging or
+            activating it in float; a part of `host_s`.
         step_s: shortest and longest time in s of the consistency step for an image, a part of
             `host_s`. The step makes block means of the result agree with the raw image.
     """
@@ -202,8 +205,15 @@ class Prediction:
         return sum(layer.work.map_bytes for layer in self.layers)
 
 
+NO_FLOATS = FloatWork()
+
+
 def predict(
-    placement: Placement, dpu: Dpu, task: Task | None = None, step_px: float = 0.0
+    placement: Placement,
+    dpu: Dpu,
+    task: Task | None = None,
+    step_px: float = 0.0,
+    float_work: FloatWork = NO_FLOATS,
 ) -> Prediction:
     """Predict the rate and latency of a network on a DPU by the cost model (see `model`).
 
@@ -216,6 +226,7 @@ def predict(
         task: what the host does with the results; None derives it from the network's operators.
         step_px: number of pixels of an image for which the host computes the consistency step,
             which makes block means of the result agree with the raw image; 0 for no step.
+        float_work: what the host computes in float of the results of an INT8 network.
 
     Raises:
         ModelError: the DPU refuses a node inside the core, or the network has no convolution.
@@ -238,8 +249,12 @@ def predict(
     parts_s = columns.parts_s(constants, structure)
     times_s = columns.time_s(constants, structure)
     refused = [node.op for node in placement.failed]
-    refused_s = refused_interval_s(refused, dpu)
     task = task or task_of(placement)
+    parts_of_host_s = (
+        refused_interval_s(refused, dpu),
+        float_interval_s(placement, task, float_work, dpu),
+    )
+    refused_s = (sum(low for low, _ in parts_of_host_s), sum(high for _, high in parts_of_host_s))
     step_s = consistency_interval_s(step_px, dpu) if step_px else (0.0, 0.0)
     host_parts = host_parts_s(placed_work(placement, task)[None], constants)
     host_parts /= dpu.whole("cpu", "cores")

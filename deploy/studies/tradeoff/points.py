@@ -25,7 +25,14 @@ from beers_deploy.model.traditional.baselines import BASELINES
 from beers_deploy.model.traditional.patch_groups import QUALITIES
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.performance import tables
-from beers_deploy.performance.swath import Swath, efficiency, energy, pipeline_rate, swath_latency
+from beers_deploy.performance.swath import (
+    Swath,
+    efficiency,
+    energy,
+    float_work,
+    pipeline_rate,
+    swath_latency,
+)
 from beers_deploy.profiles.errors import ModelError, OptionError, printable
 from beers_deploy.profiles.figures import Figure, predicted, unavailable
 from beers_deploy.profiles.sensor import Sensor
@@ -256,8 +263,10 @@ def dpu_latency(variant: Variant, dpu: Dpu, swath: Swath) -> Figure:
         dpu: the configuration of the DPU that runs the network.
         swath: the large image, with the size and halo of its tiles. Whole tiles are counted.
     """
-    placement = place(_graph(network_of_variant(variant), swath.tile_px), dpu)
-    prediction = predict(placement, dpu, step_px=swath.step_px)
+    network = network_of_variant(variant)
+    placement = place(_graph(network, swath.tile_px), dpu)
+    floats = float_work(network)
+    prediction = predict(placement, dpu, step_px=swath.step_px, float_work=floats)
     return swath_latency(prediction, math.ceil(swath.tiles * swath.runs / prediction.batch))
 
 

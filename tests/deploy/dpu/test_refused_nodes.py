@@ -7,14 +7,17 @@ import pytest
 
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
-from beers_deploy.dpu.cost.host import refused_interval_s
-from beers_deploy.dpu.cost.latency import Prediction
+from beers_deploy.dpu.cost.host import FloatWork, float_interval_s, refused_interval_s
+from beers_deploy.dpu.cost.latency import Prediction, predict
 from beers_deploy.dpu.cost.model import between
-from beers_deploy.dpu.reading import read_network
-from beers_deploy.performance.swath import predict_network
+from beers_deploy.dpu.reading import network_of, read_network
+from beers_deploy.network import Network
+from beers_deploy.performance.swath import float_work, predict_network
 from beers_deploy.performance.tables import host_words
 from beers_deploy.profiles.errors import ModelError
 from tests.deploy.dpu.graphs import IntegerSketch, Sketch
+from tests.quant.quick import patches_of, quickly
+from tests.quant.test_host_end import float_network
 
 DPU = load_dpu("vck190")
 
@@ -139,3 +142,21 @@ def test_results_of_few_bands_become_an_image_and_scores_do_not(tmp_path: Path) 
         )
         path = sketch.save(tmp_path / f"{channels}.onnx", last)
         assert predict_network(path, DPU, 64).task == task
+
+
+def test_what_the_host_computes_in_float_takes_time_in_both_files() -> None:
+    """The INT8 file states it in its description, and the float file by its operators."""
+    network = float_network("Tanh of the correction of the enlarged image")
+    raw = np.random.default_rng(0).random((1, 2, 40, 40), dtype=np.float32)
+    int8 = quickly(network, patches_of([raw])).host
+    work = float_work(Network.load(int8))
+    assert work == FloatWork(("nearest", "Tanh"), copies=2)
+    placed = place(network_of(int8, 64), DPU)
+    low, high = float_interval_s(placed, "image", work, DPU)
+    assert 0 < low < high
+    assert float_interval_s(placed, "image", FloatWork(), DPU) == (0, 0)
+    of_float = float_interval_s(place(network_of(network, 64), DPU), "image", FloatWork(), DPU)
+    assert of_float == pytest.approx((low, high))
+    with_it, without = (predict(placed, DPU, float_work=each) for each in (work, FloatWork()))
+    assert with_it.latency_s > without.latency_s
+    assert with_it.host_interval_s[1] - without.host_interval_s[1] > high
