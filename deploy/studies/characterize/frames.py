@@ -191,8 +191,8 @@ def read_raw(path: Path) -> np.ndarray:
         0 where pixels are missing.
 
     Raises:
-        ImageError: the image has several bands, or values that are no whole numbers of 0 to
-            `MAX_DN`.
+        ImageError: the image has several bands, no pixel with a value, or values that are no whole
+            numbers of 0 to `MAX_DN`.
     """
     with open_raster(path) as source:
         raster = source.raster
@@ -204,7 +204,13 @@ def read_raw(path: Path) -> np.ndarray:
         )
     pixels: np.ndarray = np.ma.getdata(rows)[0]
     if raster.may_miss:
-        pixels = np.where(raster.missing(rows)[0], 0, pixels)
+        missing = raster.missing(rows)[0]
+        if missing.all():
+            raise ImageError(
+                f"{path} has no pixels with values, only NaN or nodata. Check that it is the right "
+                "file."
+            )
+        pixels = np.where(missing, 0, pixels)
     if (
         (pixels.dtype.kind == "f" and (pixels != np.rint(pixels)).any())
         or pixels.min() < 0

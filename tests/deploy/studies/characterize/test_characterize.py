@@ -214,7 +214,7 @@ WRONG: dict[str, tuple[np.ndarray, str, str]] = {
     "fractions": (FLAT.astype(np.float32), "--bits 12", "whole digital numbers"),
     "negative": (FLAT.astype(np.int16) - 2000, "--bits 12", "from 0 to 65535"),
     "wide": (FLAT.astype(np.uint32) * 70, "--bits 16", "from 0 to 65535"),
-    "all missing": (np.full((200, 200), np.nan, np.float32), "--bits 12", "unclipped"),
+    "all missing": (np.full((200, 200), np.nan, np.float32), "--bits 12", "no pixels with values"),
     "steps": (RAW * 16 + 3, "--bits 16", "Divide them by 16"),
     "black": (RAW, "--bits 12 --black-level 1500", "--black-level must be at least 0"),
     "mtf": (RAW, "--bits 12 --mtf 7", "Write 0.07 for 7 %"),
