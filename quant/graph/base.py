@@ -54,8 +54,8 @@ class Base:
             image = image[:, list(self.channels)]
         if self.factor == 1:
             return image
+        # First along the columns, then along the rows.
         for _ in range(2):
-            # Once along the rows, once along the columns.
             count, channels, height, width = image.shape
             wide = np.pad(image, [(0, 0), (0, 0), (REACH_PX, REACH_PX), (0, 0)], "edge")
             phases = [

@@ -68,11 +68,11 @@ def host_part_from_json(record: Mapping[str, Any]) -> HostPart:
     limits = tuple(map(float, record.get("limits", ())))
     require_ranges((*ranges, limits) if limits else ranges)
     base = Base(**record.get("base", {}))
-    base = replace(base, channels=tuple(map(int, base.channels)))
+    base = replace(base, channels=tuple(map(int, base.channels)), factor=int(base.factor))
     activation = record.get("activation", "")
     is_known = activation in ("", *ACTIVATIONS) and base.mode in get_args(Mode)
     is_known = is_known and 0 <= int(record.get("crop_px", 0)) <= MOST_MARGIN_PX * WINDOW_PX
-    if not is_known or not 1 <= int(base.factor) <= WINDOW_PX:
+    if not is_known or not 1 <= base.factor <= WINDOW_PX:
         raise ValueError(f"{base} or {activation!r}, which the host does not compute")
     part = HostPart(
         channels=int(record["channels"]),

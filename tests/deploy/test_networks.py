@@ -227,6 +227,7 @@ def test_a_run_parses_and_opens_a_network_once(
     assert counts == {"parse_onnx": 1, "tiling_of": 1, "InferenceSession": 1}
 
 
+@pytest.mark.slow
 def test_an_int8_file_for_every_sensor_restores_and_is_judged_as_the_shipped_name(
     tmp_path: Path,
 ) -> None:

@@ -65,6 +65,8 @@ def test_a_description_states_the_whole_host_part(part: HostPart) -> None:
         {"activation": "Exp"},
         {"base": {"factor": 0}},
         {"base": {"channels": [1]}},
+        {"base": {"factor": "twice"}},
+        {"crop_px": -1},
     ],
 )
 def test_a_damaged_description_is_refused(damage: dict[str, Any]) -> None:

@@ -233,6 +233,7 @@ return report;
 """
 
 
+@pytest.mark.slow
 def test_the_divider_separates_two_layers_on_a_desktop_and_on_a_telephone(
     tmp_path: Path,
 ) -> None:

@@ -56,6 +56,7 @@ KNOWN = Stated(bits=12, mtf=(0.1, 0.1))
 """With a stated MTF no edge is searched for. The search takes most of the time."""
 
 
+@pytest.mark.slow
 def test_the_profile_is_that_of_the_sensor(raw: tuple[Path, Path], tmp_path: Path) -> None:
     out = tmp_path / "mine.toml"
     figures = tmp_path / "mine.json"
