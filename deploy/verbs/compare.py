@@ -1,4 +1,4 @@
-"""`compare`: a float and an INT8 network on the same samples. No command: that is `gate`."""
+"""Compare a float and an INT8 network on the same samples, for Python: the command is `gate`."""
 
 from typing import TYPE_CHECKING, Annotated, Literal
 

@@ -70,9 +70,10 @@ def host_part_from_json(record: Mapping[str, Any]) -> HostPart:
     base = Base(**record.get("base", {}))
     base = replace(base, channels=tuple(map(int, base.channels)), factor=int(base.factor))
     activation = record.get("activation", "")
+    crop_px = int(record.get("crop_px", 0))
     is_known = activation in ("", *ACTIVATIONS) and base.mode in get_args(Mode)
-    is_known = is_known and 0 <= int(record.get("crop_px", 0)) <= MOST_MARGIN_PX * WINDOW_PX
-    if not is_known or not 1 <= base.factor <= WINDOW_PX:
+    is_within = 1 <= base.factor <= WINDOW_PX and 0 <= crop_px <= MOST_MARGIN_PX * WINDOW_PX
+    if not (is_known and is_within):
         raise ValueError(f"{base} or {activation!r}, which the host does not compute")
     part = HostPart(
         channels=int(record["channels"]),
@@ -84,7 +85,7 @@ def host_part_from_json(record: Mapping[str, Any]) -> HostPart:
         decoding=_decoding(record),
         input_ranges=ranges,
         limits=limits,
-        crop_px=int(record.get("crop_px", 0)),
+        crop_px=crop_px,
         activation=activation,
         base=base,
     )
