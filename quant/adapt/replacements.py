@@ -20,6 +20,10 @@ And by another function again:
    (`quant.graph.attention`).
 7. Maps that are padded by reflection or by their edge are padded by zeros. The host mirrors the
    image beyond its borders and crops the result, so that the zeros lie outside of it.
+8. Bilinear enlargement with other centres becomes one with half-pixel centres. Aligned corners are
+   up to a quarter of a small pixel away.
+9. Bicubic enlargement of the image becomes a transposed convolution with the same weights. Where
+   the original repeats the border of the image, the host mirrors it.
 
 Mish, ELU and Softplus stay: no function of the DPU is near enough to be fitted.
 """
@@ -33,8 +37,10 @@ import onnx
 
 from beers_deploy.quant.adapt.zero_padding import pad_by_zeros, pads_of
 from beers_deploy.quant.graph.attention import aligned, shrinking
+from beers_deploy.quant.graph.base import REACH_PX, Base
 from beers_deploy.quant.graph.host_end import host_end
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
+from beers_deploy.quant.graph.resize import Resizing, alone_enlarges_image
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.activations_first import activations_first
 from beers_deploy.quant.simplify.fold_affine import (
@@ -44,7 +50,7 @@ from beers_deploy.quant.simplify.fold_affine import (
     per_channel,
 )
 from beers_deploy.quant.simplify.spelled_activations import gelu_gate_input, other_operand
-from beers_deploy.quant.simplify.standard_operators import float_shapes
+from beers_deploy.quant.simplify.standard_operators import Shapes, channels_in, float_shapes
 
 
 class Kind(StrEnum):
@@ -60,6 +66,8 @@ class Kind(StrEnum):
     prelu = "PReLU"
     attention = "spatial attention (ESA)"
     padding = "reflecting padding"
+    centres = "bilinear enlargement with other centres"
+    cubic = "bicubic enlargement"
 
 
 APPROXIMATIONS = {
@@ -70,8 +78,10 @@ APPROXIMATIONS = {
     Kind.prelu: "LeakyReLU of 26/256",
     Kind.attention: "attention on an eighth of the sides",
     Kind.padding: "zeros around the mirrored image",
+    Kind.centres: "bilinear enlargement with half-pixel centres",
+    Kind.cubic: "a transposed convolution of the mirrored image",
 }
-"""The other function that replaces each kind (1 to 3, 6 and 7)."""
+"""The other function that replaces each kind (1 to 3, and 6 to 9)."""
 EXACT = {
     Kind.hard_sigmoid: "HardSigmoid of a scaled input",
     Kind.leaky_relu: "ReLU in a second branch, and an Add",
@@ -93,11 +103,14 @@ def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
         The kind; None if the node is not replaced, such as a Sigmoid that is a part of a SiLU.
     """
     attributes = node.attributes
+    resizing = Resizing.of(node, graph) if node.op_type == "Resize" else None
     kinds = {
         Kind.attention: shrinking(graph, node),
         Kind.silu: silu_input(graph, node),
         Kind.padding: pads_of(graph, node),
         Kind.tanh: node.op_type == "Tanh",
+        Kind.centres: resizing is not None and resizing.is_nearly_bilinear,
+        Kind.cubic: alone_enlarges_image(graph, node),
     }
     for kind, is_of_kind in kinds.items():
         if is_of_kind:
@@ -219,12 +232,13 @@ def replaced(
     graph = OnnxGraph(network)
     # Before the graph changes, because a SiLU is known by the Sigmoid in front of it.
     plan: dict[Node, list[Node]] = {}
+    shapes = float_shapes(graph)
     for kind, nodes in nodes_by_kind(graph).items():
         if kind is Kind.attention and kind in approximated:
             for node in nodes:
                 plan |= aligned(graph, node)
         elif kind in approximated and kind is not Kind.padding:
-            plan |= {node: _approximation(graph, node, kind) for node in nodes}
+            plan |= {node: _approximation(shapes, graph, node, kind) for node in nodes}
         elif kind in exact and kind is Kind.hard_sigmoid:
             plan |= {node: _scaled_hard_sigmoid(graph, node) for node in nodes}
         elif kind in exact:
@@ -240,12 +254,14 @@ def replaced(
     return network
 
 
-def _approximation(graph: OnnxGraph, node: Node, kind: Kind) -> list[Node]:
-    """Return the nodes of another function that replaces an activation.
+def _approximation(shapes: Shapes, graph: OnnxGraph, node: Node, kind: Kind) -> list[Node]:
+    """Return the nodes of another function that replaces an operator.
 
     Args:
+        shapes: the sizes of each float tensor by name.
         graph: the graph that the node belongs to.
-        node: the Mul of a SiLU or GELU, a Gelu, a Sigmoid, a Tanh, a LeakyReLU or a PReLU.
+        node: the Mul of a SiLU or GELU, a Gelu, a Sigmoid, a Tanh, a LeakyReLU, a PReLU or a
+            Resize.
         kind: its kind.
     """
     (output,) = node.outputs
@@ -255,6 +271,11 @@ def _approximation(graph: OnnxGraph, node: Node, kind: Kind) -> list[Node]:
         return [Node.new("HardSigmoid", node.inputs, output, node.name, alpha=1 / 6, beta=0.5)]
     if kind is Kind.tanh:
         return _clipped_line(graph, node)
+    if kind is Kind.centres:
+        bilinear = {"mode": "linear", "coordinate_transformation_mode": "half_pixel"}
+        return [Node.new("Resize", node.inputs, output, node.name, **bilinear)]
+    if kind is Kind.cubic:
+        return _cubic_convolution(shapes, graph, node)
     return [Node.new("LeakyRelu", node.inputs[:1], output, node.name, alpha=LEAKY_SLOPE)]
 
 
@@ -274,6 +295,43 @@ def _clipped_line(graph: OnnxGraph, node: Node) -> list[Node]:
         Node.new("Clip", [shifted, zero, six], clipped, node.name),
         _times(graph, clipped, np.array([1 / 3]), shrunk),
         Node.new("Add", [shrunk, minus_one], output, f"{output}.lowered"),
+    ]
+
+
+def _cubic_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node]:
+    """Return a transposed convolution of the mirrored image in place of a bicubic Resize.
+
+    The Resize remains where a sum reads it: the host computes that.
+    """
+    (image, *_) = node.inputs
+    (result,) = node.outputs
+    convolved = f"{result}.convolved"
+    for reader in graph.readers[result]:
+        if reader.op_type != "Add":
+            reader.inputs = tuple(convolved if name == result else name for name in reader.inputs)
+    factor = int(Resizing.of(node, graph).factors[2])
+    base = Base(factor=factor, mode="cubic")
+    weight = base.kernel(channels_in(shapes, image))
+    mirrored = f"{result}.mirrored"
+    border = np.array([0, 0, REACH_PX, REACH_PX] * 2)
+    names = [
+        graph.add_constant(f"{result}.border", border, np.int64),
+        graph.add_constant(f"{result}.weight", weight),
+    ]
+    convolution = Node.new(
+        "ConvTranspose",
+        [mirrored, names[1]],
+        convolved,
+        convolved,
+        kernel_shape=list(weight.shape[2:]),
+        strides=[factor] * 2,
+        # It crops what the border becomes.
+        pads=[base.kernel_pad + REACH_PX * factor] * 4,
+    )
+    return [
+        Node.new("Pad", [image, names[0]], mirrored, mirrored, mode="reflect"),
+        convolution,
+        node,
     ]
 
 

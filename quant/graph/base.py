@@ -48,6 +48,29 @@ class Base:
         weights = np.where(distances <= 1, near, np.where(distances < 2, far, 0))
         return np.asarray(weights, np.float32)
 
+    def kernel(self, channels: int) -> np.ndarray:
+        """Return the weights (C, C, k, k) float32 of a transposed convolution, of stride `factor`,
+        that enlarges as this does, but for the border.
+
+        Args:
+            channels: the number C of channels.
+        """
+        # Pixel p of those that a pixel becomes reads its neighbour at offset o by the weight
+        # p - o factor, counted from the middle.
+        taps = self.weights[:, ::-1].T.ravel()
+        # Weights of 0 at the ends, because an even factor puts no pixel so far from its neighbour.
+        half = self.factor // 2
+        taps = taps[half:-half]
+        weight = np.eye(channels)[:, :, None, None] * np.outer(taps, taps)
+        return np.asarray(weight, np.float32)
+
+    @property
+    def kernel_pad(self) -> int:
+        """The pads of that convolution at each side, with which the result has the size of the
+        enlarged image.
+        """
+        return REACH_PX * self.factor - self.factor // 2
+
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Return the base (N, C', factor H, factor W) of an image (N, C, H, W)."""
         if self.channels:

@@ -172,7 +172,7 @@ def _base(graph: OnnxGraph, name: str, image: str) -> Base | None:
     is_exact = factor & (factor - 1) == 0
     is_plain = node.attributes.get("cubic_coeff_a", CUBIC) == CUBIC
     is_plain = is_plain and not node.attributes.get("exclude_outside", 0)
-    if resizing.where not in ("half_pixel", "pytorch_half_pixel") or not (is_exact and is_plain):
+    if not (resizing.is_half_pixel and is_exact and is_plain):
         return None
     modes: dict[str, Mode] = {"linear": "linear", "cubic": "cubic"}
     return replace(source, factor=factor, mode=modes[resizing.mode])

@@ -19,7 +19,7 @@ from beers_deploy.quant.graph.operations import (
     Shuffle,
 )
 from beers_deploy.quant.graph.pixel_shuffle import MOVES, ORDERS
-from beers_deploy.quant.graph.resize import Resizing
+from beers_deploy.quant.graph.resize import Resizing, alone_enlarges_image
 from beers_deploy.quant.graph.split_network import ADAPT, ADAPT_EXACTLY, REMEDY, unsupported
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.window import Pair, Window
@@ -151,11 +151,11 @@ def _read_resize(node: Node, graph: OnnxGraph) -> Op:
     )
     # A DPU enlarges bilinearly by 2 and 4 alone where centres are half-pixel ones.
     if resizing.mode == "linear":
-        half = where in ("half_pixel", "pytorch_half_pixel") and factor in (2, 4)
         require(
-            half,
+            resizing.is_half_pixel and factor in (2, 4),
             node,
             f"must enlarge bilinearly by 2 or 4 with half-pixel centres, got {where} by {factor}",
+            ADAPT if resizing.is_nearly_bilinear else REMEDY,
         )
     else:
         blocks = resizing.mode == "nearest" and resizing.makes_blocks(factor)
@@ -164,6 +164,7 @@ def _read_resize(node: Node, graph: OnnxGraph) -> Op:
             node,
             "must make a block of each pixel, or be bilinear by 2 or 4, got "
             f"{resizing.mode}, {where}, {resizing.rounding} by {factor}",
+            ADAPT if alone_enlarges_image(graph, node) else REMEDY,
         )
     return Resize(node.name, node.inputs[0], node.outputs[0], factor, resizing.mode == "linear")
 

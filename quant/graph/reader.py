@@ -3,6 +3,7 @@
 A file from outside is checked once, here; later code does not check it again.
 """
 
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import replace
 
@@ -24,8 +25,10 @@ from beers_deploy.quant.graph.operations import (
     Mul,
     Op,
     Pointwise,
+    Resize,
 )
 from beers_deploy.quant.graph.pixel_shuffle import with_shuffles
+from beers_deploy.quant.graph.resize import Resizing, enlarges_image
 from beers_deploy.quant.graph.split_network import (
     ADAPT,
     REMEDY,
@@ -156,8 +159,10 @@ class _Reader:
         """
         source = self.source
         pads = [node for node in source.nodes if node.op_type == "Pad"]
-        others = [node.op_type for node in source.readers[self.image] if node not in pads]
-        is_mirror = len(pads) == 1 and pads[0].inputs[0] == self.image and not set(others) - {"Add"}
+        others = [node for node in source.readers[self.image] if node not in pads]
+        # The host adds the image, or enlarges it.
+        is_of_host = all(n.op_type == "Add" or enlarges_image(source, n) for n in others)
+        is_mirror = len(pads) == 1 and pads[0].inputs[0] == self.image and is_of_host
         if not is_mirror or pads[0].attributes.get("mode") != "reflect":
             return 0
         amounts = source.numbers(pads[0], 1, "pads") or [0]
@@ -192,8 +197,7 @@ class _Reader:
                 self._read(node)
             except AdaptableError as error:
                 self.adaptable = self.adaptable or error
-                stand_in = Activation.hard_sigmoid
-                self._append(Pointwise(node.name, node.inputs[0], node.outputs[0], stand_in))
+                self._append(_stand_in(node, self.source))
         if not self.ops or self.ops[-1].output != result:
             raise unsupported("No operation writes the network's output.")
         graph = named_apart(self.ops, {self.image: IMAGE, result: CORRECTION})
@@ -228,7 +232,8 @@ class _Reader:
             if node.op_type == "Pad":
                 raise _refused(node, self.source)
             if node.op_type == "Resize" and node.outputs[0] not in self.end.replaced:
-                READERS[node.op_type](node, self.source)
+                with suppress(AdaptableError):
+                    READERS[node.op_type](node, self.source)
 
     def _read(self, node: Node) -> None:
         if node.op_type in ACTIVATIONS:
@@ -299,6 +304,14 @@ class _Reader:
             self._places[output] = self._places.pop(source)
         else:
             self._append(Pointwise(node.name, source, node.outputs[0], activation))
+
+
+def _stand_in(node: Node, graph: OnnxGraph) -> Op:
+    """Return an operation in place of a node that can be adapted, so that the rest is read."""
+    source, result = node.inputs[0], node.outputs[0]
+    if node.op_type == "Resize":
+        return Resize(node.name, source, result, int(Resizing.of(node, graph).factors[2]), True)
+    return Pointwise(node.name, source, result, Activation.hard_sigmoid)
 
 
 def _refused(node: Node, graph: OnnxGraph) -> ModelError:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from beers_deploy.quant.graph.base import CUBIC
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 
 PLACES: dict[str, Callable[[int, float], float]] = {
@@ -22,6 +23,8 @@ ROUNDINGS: dict[str, Callable[[float], int]] = {
     "round_prefer_floor": lambda place: math.ceil(place - 0.5),
     "round_prefer_ceil": lambda place: math.floor(place + 0.5),
 }
+
+BY_2_OR_4 = (1, 1, 2, 2), (1, 1, 4, 4)
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,18 @@ class Resizing:
             attribute("nearest_mode", "floor" if old else "round_prefer_floor"),
         )
 
+    @property
+    def is_half_pixel(self) -> bool:
+        """True if the centres of pixels lie at half of their width, as a DPU has them."""
+        return self.where in ("half_pixel", "pytorch_half_pixel")
+
+    @property
+    def is_nearly_bilinear(self) -> bool:
+        """True if the bilinear enlargement of a DPU is near: this one has other centres, such as
+        those of aligned corners.
+        """
+        return self.mode == "linear" and not self.is_half_pixel and self.factors in BY_2_OR_4
+
     def makes_blocks(self, factor: int) -> bool:
         """Return True if nearest interpolation turns each pixel into a block of `factor` x `factor`
         pixels.
@@ -74,3 +89,32 @@ class Resizing:
         place = PLACES[self.where]
         rounded = ROUNDINGS[self.rounding]
         return all(rounded(place(k, factor)) == k // factor for k in range(factor))
+
+
+def enlarges_image(graph: OnnxGraph, node: Node) -> bool:
+    """Return True if a node enlarges the image by 2 or 4, bicubically with half-pixel centres.
+
+    Args:
+        graph: the graph that the node belongs to.
+        node: any node.
+    """
+    if node.op_type != "Resize":
+        return False
+    resizing = Resizing.of(node, graph)
+    attribute = node.attributes.get
+    is_plain = attribute("cubic_coeff_a", CUBIC) == CUBIC and not attribute("exclude_outside", 0)
+    is_cubic = resizing.mode == "cubic" and resizing.is_half_pixel and is_plain
+    return is_cubic and resizing.factors in BY_2_OR_4 and node.inputs[0] in graph.inputs
+
+
+def alone_enlarges_image(graph: OnnxGraph, node: Node) -> bool:
+    """Return True if a node enlarges the image bicubically, and the network reads the image nowhere
+    else but in a sum.
+
+    Args:
+        graph: the graph that the node belongs to.
+        node: any node.
+    """
+    readers = graph.readers[node.inputs[0]]
+    is_alone = all(reader is node or reader.op_type == "Add" for reader in readers)
+    return is_alone and enlarges_image(graph, node)

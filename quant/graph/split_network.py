@@ -34,10 +34,7 @@ REMEDY = (
     "See docs/reference/any-network.md for the operators that 'quantize' accepts; 'check' names "
     "what a DPU does not run."
 )
-ADAPT = (
-    "'quantize --adapt' (adapt=True) replaces SiLU, GELU, Sigmoid, Tanh, LeakyReLU, PReLU and "
-    "RFDN's spatial attention, and measures the cost."
-)
+ADAPT = "'quantize --adapt' (adapt=True) replaces it by what a DPU computes, and measures the cost."
 ADAPT_EXACTLY = "'quantize --adapt' (adapt=True) rewrites it exactly."
 
 

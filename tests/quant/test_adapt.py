@@ -502,6 +502,57 @@ def test_spatial_attention_is_aligned_and_compensated(free: bool) -> None:
     assert near > 40
 
 
+def enlarging(mode: str, where: str, factor: int, adds: bool) -> onnx.ModelProto:
+    """Build two convolutions of the enlarged image, which adds the result to it if asked."""
+    w = GraphWriter()
+    scales = w.constant("scales", np.array([1, 1, factor, factor], np.float32))
+    attributes = {"mode": mode, "coordinate_transformation_mode": where, "cubic_coeff_a": -0.75}
+    wide = w.node("Resize", "wide", ["image", "", scales], **attributes)
+    first = w.node("Relu", "first", [conv(w, wide, "a", IMAGE_WEIGHTS)])
+    correction = conv(w, first, "b", RESULT_WEIGHTS)
+    w.node("Add", "restored", [correction, wide if adds else correction])
+    return finished(w)
+
+
+@pytest.mark.parametrize(("where", "factor"), [("align_corners", 2), ("asymmetric", 4)])
+def test_bilinear_enlargement_has_half_pixel_centres(where: str, factor: int) -> None:
+    """It is near to the original, and of the network's sizes."""
+    model = enlarging("linear", where, factor, adds=False)
+    with pytest.raises(ModelError, match=r"half-pixel centres.*'quantize --adapt'"):
+        read_network(model)
+    adapted = adapt(model, BARE, BARE)
+    assert adapted.rows[0].name == "1 bilinear enlargement with other centres"
+    near = adapted.rows[-1].figures[TO_ORIGINAL].value
+    assert near is not None
+    assert near > 30
+    (op,) = [op for op in read_network(adapted.model).graph if isinstance(op, Resize)]
+    assert (op.factor, op.bilinear) == (factor, True)
+
+
+@pytest.mark.parametrize(("factor", "adds"), [(2, True), (4, True), (2, False)])
+def test_bicubic_enlargement_is_a_convolution_of_the_mirrored_image(
+    factor: int, adds: bool
+) -> None:
+    """Only the border differs, and the host enlarges what is added to the result."""
+    model = enlarging("cubic", "half_pixel", factor, adds)
+    with pytest.raises(ModelError, match="'quantize --adapt'"):
+        read_network(model)
+    adapted = adapt(model, BARE, BARE)
+    pixels = image(20, 28)
+    expected, actual = (
+        result_of(open_session(network), pixels) for network in (model, adapted.model)
+    )
+    border_px = 3 * factor
+    inner = np.s_[..., border_px:-border_px, border_px:-border_px]
+    np.testing.assert_allclose(actual[inner], expected[inner], atol=2e-5)
+    split = read_network(adapted.model)
+    assert (split.base.factor, split.border_px) == (factor if adds else 1, 2)
+    int8 = quickly(adapted.model, BARE)
+    error = np.abs(result_of(open_session(int8.host), pixels) - expected).mean()
+    assert error < 0.02
+    check_tiles(int8.host, pixels, (12, 16))
+
+
 def test_finetuning_learns_from_the_original() -> None:
     """Fine-tuning that is given the original ends nearer to it than without.
 
