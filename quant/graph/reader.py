@@ -73,7 +73,9 @@ REMEDIES = {
     ),
     **dict.fromkeys(("ReduceL2", "ReduceMax", "ReduceMean", "ReduceSum"), STATISTICS),
     **dict.fromkeys(("PRelu", "Sigmoid", "Tanh", "Gelu", "Erf"), ADAPT),
-    **dict.fromkeys(("ConstantOfShape", "Expand", "Shape", "Size", "Tile"), OF_ONE_SIZE),
+    **dict.fromkeys(
+        ("ConstantOfShape", "Expand", "GlobalMaxPool", "Shape", "Size", "Tile"), OF_ONE_SIZE
+    ),
     "Pad": (
         "Pad by zeros in the convolution; 'quantize --adapt' (adapt=True) replaces reflecting "
         "padding in front of convolutions, and measures the cost."

@@ -5,6 +5,8 @@
 3. Activations on a flat tensor are applied to the map instead, and a Softmax over a flat tensor
    becomes one along the channels of one pixel.
 4. A Reshape that restores the map is removed, and the flattening with it.
+5. A convolution along the channels of one pixel, as in efficient channel attention (ECA), becomes a
+   convolution of that pixel that connects neighbouring channels.
 
 A flattening remains behind each of them, and is removed if nothing reads it.
 """
@@ -17,6 +19,7 @@ from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.standard_operators import Shapes
 
 POINTWISE = {"Clip", "Elu", "HardSigmoid", "HardSwish", "LeakyRelu", "Relu", "Sigmoid", "Tanh"}
+MOVES = {"Flatten", "Reshape", "Squeeze", "Transpose", "Unsqueeze"}
 Map = tuple[int, int, int]
 """Channels, height, width."""
 
@@ -104,3 +107,59 @@ class ConnectByConvolutions:
         image.outputs = (f"{name}.map",)
         self._maps[name] = image.outputs[0], size
         return [image, Node.new("Flatten", image.outputs, name, f"{name}.flat")]
+
+
+def connect_neighbours(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace a convolution along the channels of one pixel by one of that pixel (5).
+
+    Args:
+        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
+        graph: the graph that the node belongs to; its constants are extended.
+        node: any node; the last one that moves values behind the convolution is replaced.
+
+    Returns:
+        The convolution and the activations behind it; None if the node is something else.
+    """
+    (result, *_) = node.outputs
+    size = shapes.get(result, ())
+    channels = size[1] if len(size) == 4 else 0
+    if node.op_type not in MOVES or not channels or size[2:] != (1, 1):
+        return None
+    activations, convolution = _behind(graph, result, MOVES | POINTWISE)
+    weight = graph.value(convolution, 1) if convolution is not None else None
+    if convolution is None or convolution.op_type != "Conv" or len(convolution.inputs) != 2:
+        return None
+    # Nodes that move values keep the order of the channels, because each other size is 1.
+    _, before = _behind(graph, convolution.inputs[0], MOVES)
+    source = before.outputs[0] if before is not None else ""
+    if weight is None or weight.shape[:-1] != (1, 1) or shapes.get(source, ())[1:] != size[1:]:
+        return None
+    taps = weight.ravel()
+    pad = len(taps) // 2
+    attribute = convolution.attributes.get
+    is_plain = attribute("strides", [1]) == attribute("dilations", [1]) == [1]
+    if attribute("pads") != [pad] * 2 or not is_plain:
+        return None
+    band = sum(tap * np.eye(channels, k=k - pad) for k, tap in enumerate(taps))
+    nodes = [graph.convolution(source, f"{result}.0", convolution.name, band[..., None, None])]
+    for number, activation in enumerate(activations, 1):
+        inputs = [f"{result}.{number - 1}", *activation.inputs[1:]]
+        copy = Node.of(activation.written())
+        copy.inputs = tuple(inputs)
+        copy.outputs = (f"{result}.{number}",)
+        nodes.append(copy)
+    nodes[-1].outputs = (result,)
+    return nodes
+
+
+def _behind(graph: OnnxGraph, name: str, skipped: set[str]) -> tuple[list[Node], Node | None]:
+    """Return the first node in front of a tensor whose operator is not to be skipped, and the
+    activations between, in order.
+    """
+    activations: list[Node] = []
+    node = graph.writers.get(name)
+    while node is not None and node.op_type in skipped:
+        if node.op_type in POINTWISE:
+            activations.insert(0, node)
+        node = graph.writers.get(node.inputs[0])
+    return activations, node

@@ -10,8 +10,9 @@ these properties:
    convolution that only it reads, nor in front of convolutions where folding is exact. A remaining
    BatchNormalization of images is a depthwise 1 x 1 convolution. Zeros that Pad adds are the
    convolution's own.
-4. Sub of two maps is Add, Max, Min and Abs of maps are Adds with ReLU, Sum is Add, a square is a
-   product, a mean over the image is GlobalAveragePool. HardSwish is one operator, ReLU6 is Clip
+4. Sub of two maps is Add, Max, Min and Abs of maps are Adds with ReLU, and so is the maximum over
+   channels; Sum is Add, a square is a product, a mean over the image is GlobalAveragePool, a
+   maximum over an image of known size MaxPool. HardSwish is one operator, ReLU6 is Clip
    from 0 to 6, and a Clip at 0 alone is ReLU. Activations precede what only moves values. Nothing
    splits or crops a map: each part is computed separately. Kernels have at most 64 positions.
    Nothing is computed from the size of the image, unless the size has an effect. The channels of
@@ -59,7 +60,7 @@ from beers_deploy.quant.simplify.fold_affine import (
     fold_in_front,
 )
 from beers_deploy.quant.simplify.free_sizes import free_rectangle, free_sizes
-from beers_deploy.quant.simplify.fully_connected import ConnectByConvolutions
+from beers_deploy.quant.simplify.fully_connected import ConnectByConvolutions, connect_neighbours
 from beers_deploy.quant.simplify.grouped_convolutions import without_groups
 from beers_deploy.quant.simplify.image_residual import add_to_image, clip_last
 from beers_deploy.quant.simplify.large_kernels import split_large_kernel
@@ -83,6 +84,7 @@ from beers_deploy.quant.simplify.standard_operators import (
     drop_where,
     float_shapes,
     multiply_squares,
+    pool_maximum,
     pool_mean,
     shrink_by_convolution,
     split_sums,
@@ -192,6 +194,8 @@ def _run_passes(model: onnx.ModelProto) -> None:
         repeat_channels,
         drop_cast,
         pool_mean,
+        pool_maximum,
+        connect_neighbours,
         shrink_by_convolution,
         convolve_affine,
         unshuffle_slices,

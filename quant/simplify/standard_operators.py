@@ -219,6 +219,53 @@ def pool_mean(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None
     ]
 
 
+def pool_maximum(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace a maximum over rows and columns of known number by a MaxPool, and one over channels
+    by maxima of two halves, until one channel is left: max(a, b) = b + ReLU(a - b).
+
+    Args:
+        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
+        graph: the graph that the node belongs to; its constants are extended.
+        node: any node.
+
+    Returns:
+        The nodes that replace the maximum; None if the node is something else.
+    """
+    if node.op_type not in ("GlobalMaxPool", "ReduceMax"):
+        return None
+    source = node.inputs[0]
+    size = shapes.get(source, ())
+    # From opset 18 on the axes are an input.
+    axes = {axis % 4 for axis in graph.numbers(node, 1, "axes") or ()}
+    (result,) = node.outputs
+    if len(size) != 4 or not node.attributes.get("keepdims", 1):
+        return None
+    is_global = node.op_type == "GlobalMaxPool" or axes == {2, 3}
+    if is_global and all(size[2:]):
+        return [Node.new("MaxPool", [source], result, node.name, kernel_shape=list(size[2:]))]
+    channels = size[1]
+    if is_global or axes != {1} or not channels:
+        return None
+    nodes: list[Node] = []
+    while channels > 1:
+        half = -(-channels // 2)
+        first = np.eye(half, channels)
+        # The last channel of an odd number is its own partner.
+        second = np.eye(channels)[np.minimum(np.arange(half) + half, channels - 1)]
+        names = [f"{result}.{half}.{role}" for role in ("difference", "relu", "second")]
+        difference, limited, other = names
+        larger = result if half == 1 else f"{result}.{half}"
+        nodes += [
+            graph.convolution(source, difference, difference, (first - second)[..., None, None]),
+            Node.new("Relu", [difference], limited, limited),
+            graph.convolution(source, other, other, second[..., None, None]),
+            Node.new("Add", [other, limited], larger, node.name if half == 1 else larger),
+        ]
+        source = larger
+        channels = half
+    return nodes or [graph.convolution(source, result, node.name, np.ones((1, 1, 1, 1)))]
+
+
 def shrink_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a Resize to every n-th part of rows and columns by a depthwise convolution.
 

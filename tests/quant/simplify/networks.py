@@ -25,6 +25,7 @@ WEIGHTS: dict[str, tuple[int, ...]] = {
     "square": (4, 4),
     "wide": (24, 5),
     "one_one": (1, 1, 3, 3),
+    "taps": (1, 1, 3),
 }
 NUMBERS = {
     "zero": 0.0,
@@ -43,6 +44,7 @@ NUMBERS = {
     "two": [2],
     "four": [4],
     "last": [9],
+    "columns": [3],
     "one_three": [1, 3],
     "axes": [2, 3],
     "map_again": [-1, 4, 1, 1],
@@ -281,6 +283,26 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         {"GlobalAveragePool": 1, "Conv": 1, "Flatten": 1, "Unsqueeze": 1},
     ),
     "a mean over channels": ("y = ReduceMean<axes=[1]>(x)", {"Conv": 1}),
+    "the largest channel": ("y = ReduceMax<axes=[1]>(x)", {"Conv": 4, "Relu": 2, "Add": 2}),
+    "the largest of three channels": (
+        "s = Slice(x, one_int, last, one_int) y = ReduceMax<axes=[-3]>(s)",
+        {"Conv": 5, "Relu": 2, "Add": 2},
+    ),
+    "the largest pixel": (
+        "s = Resize(x, , , small) m = ReduceMax<axes=[2,3]>(s) g = GlobalMaxPool(s) y = Add(m, g)",
+        {"Resize": 1, "MaxPool": 2, "Add": 1},
+    ),
+    "attention of neighbouring channels": (
+        """p = GlobalAveragePool(x)
+        q = Squeeze(p, columns)
+        t = Transpose<perm=[0,2,1]>(q)
+        c = Conv<pads=[1,1]>(t, taps)
+        r = HardSwish(c)
+        s = Transpose<perm=[0,2,1]>(r)
+        u = Unsqueeze(s, columns)
+        y = Mul(u, x)""",
+        {"GlobalAveragePool": 1, "Conv": 1, "HardSwish": 1, "Mul": 1},
+    ),
     "three summed": (f"{CONV} d = {SAME}(c, w) y = Sum(x, c, d)", {"Conv": 2, "Add": 2}),
     "operators without an effect": (
         f"i = Identity(x) c = {SAME}(i, w) d = Dropout(c) y = Cast<to=1>(d)",
