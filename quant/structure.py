@@ -9,6 +9,7 @@ The others are the ends of the fine copy, which the coarse copy replaces
 silently.
 """
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import chain
@@ -321,11 +322,10 @@ def structure_checks(
     int8_relus = count_relus(int8)
     if (core := _own_core(int8)) is not None:
         # `quant.adapt` computes LeakyReLUs and PReLUs by a ReLU in a second branch, and a Tanh by a
-        # ReLU6. They are those of the float network less the LeakyReLUs of the integers and the
-        # Tanh of the host.
-        float_relus += sum(
-            node.op_type in ("LeakyRelu", "PRelu", "Tanh") for node in float_model.graph.node
-        )
+        # ReLU6. They are those of the float network less the LeakyReLUs of the integers, the Tanh
+        # of the host and those behind a Softplus, which are parts of Mish.
+        kinds = Counter(node.op_type for node in float_model.graph.node)
+        float_relus += kinds["LeakyRelu"] + kinds["PRelu"] + kinds["Tanh"] - kinds["Softplus"]
         float_relus -= sum(
             isinstance(op, IntConv | Pointwise) and op.activation is Activation.leaky_relu
             for op in core.ops

@@ -72,7 +72,7 @@ REMEDIES = {
         ("GroupNormalization", "InstanceNormalization", "LayerNormalization"), NORMALISES
     ),
     **dict.fromkeys(("ReduceL2", "ReduceMax", "ReduceMean", "ReduceSum"), STATISTICS),
-    **dict.fromkeys(("PRelu", "Sigmoid", "Tanh", "Gelu", "Erf"), ADAPT),
+    **dict.fromkeys(("PRelu", "Sigmoid", "Tanh", "Gelu", "Erf", "Mish"), ADAPT),
     **dict.fromkeys(
         ("ConstantOfShape", "Expand", "GlobalMaxPool", "Shape", "Size", "Tile"), OF_ONE_SIZE
     ),
@@ -322,6 +322,11 @@ def _refused(node: Node, graph: OnnxGraph) -> ModelError:
     is_mean = node.op_type == "ReduceMean" and graph.numbers(node, 1, "axes") == [1]
     if is_mean and any(other.op_type == "Sqrt" for other in graph.nodes):
         remedy = f"It begins a layer normalization. {NORMALISES}"
+    if node.op_type == "Softplus" and all(
+        reader.op_type == "Tanh" for reader in graph.readers[node.outputs[0]]
+    ):
+        # A part of Mish.
+        remedy = ADAPT
     return unsupported(f"The DPU does not compute the operation {node}.", remedy)
 
 

@@ -47,6 +47,12 @@ def silu(w: GraphWriter, x: str, name: str) -> str:
     return w.node("Mul", name, [x, gate])
 
 
+def mish(w: GraphWriter, x: str, name: str) -> str:
+    """Write x * Tanh(Softplus(x)) as exporters do."""
+    gate = w.node("Tanh", f"{name}.t", [w.node("Softplus", f"{name}.s", [x])])
+    return w.node("Mul", name, [x, gate])
+
+
 def quick_gelu(w: GraphWriter, x: str, name: str) -> str:
     """Write x * Sigmoid(1.702 x) as exporters do."""
     factor = w.constant("1.702", np.array(1.702, np.float32))
@@ -284,6 +290,7 @@ REPLACED = {
     "GELU, multiplied": (gelu(divides=False), Kind.silu, 3),
     "Sigmoid": (gated, Kind.sigmoid, 3),
     "GELU, halved in the gate": (halved_gelu, Kind.silu, 3),
+    "Mish": (mish, Kind.silu, 3),
     "Tanh": (tanh, Kind.tanh, 3),
     "LeakyReLU": (leaky(0.2), Kind.leaky_relu, 3),
     "PReLU": (prelu(*np.linspace(0.05, 0.3, FEATURES)), Kind.prelu, 3),
@@ -397,7 +404,7 @@ def test_activations_that_are_supported_or_irreplaceable_stay() -> None:
         adapt(network(silu_but_elu_third), BARE, BARE)
 
 
-@pytest.mark.parametrize("act", [prelu(0.2), hard_sigmoid(0.2, 0.5), gelu(divides=True)])
+@pytest.mark.parametrize("act", [prelu(0.2), hard_sigmoid(0.2, 0.5), gelu(True), mish])
 def test_the_refusal_names_adapt(act: Act) -> None:
     """The error about an activation that can be replaced names the option that replaces it."""
     with pytest.raises(ModelError, match=r"quantize --adapt"):
@@ -452,6 +459,7 @@ def silu_of_relu(w: GraphWriter, x: str, name: str) -> str:
         (silu_of_relu, {Kind.silu}, ()),
         (gated, {Kind.sigmoid}, ()),
         (tanh, {Kind.tanh}, ()),
+        (mish, {Kind.silu}, ()),
     ],
 )
 def test_the_gate_counts_the_relus_of_an_adapted_network(
