@@ -95,8 +95,8 @@ def quantize(
             groups of channels for a bounded time, best searches each channel without a bound.
         finetune: number of steps that train the integers on the patches; 'auto' trains for some
             minutes, as long as the error falls.
-        adapt: replace activations that the DPU lacks, such as SiLU and GELU by HardSwish, and
-            report the loss in float.
+        adapt: replace operators that the DPU lacks, such as SiLU by HardSwish, and report the loss
+            in float.
         output: name of the output to keep of a network that has several.
         seed: seed of every random draw.
         board_file: also write the core in the board's encoding: QDQ ONNX, of an NPU VINT8.
@@ -200,7 +200,7 @@ def quantize(
 
 
 HEADINGS = {
-    "adapted": "activations that the DPU lacks, and what replacing them costs in float",
+    "adapted": "operators that the DPU lacks, and what replacing them costs in float",
     "rounding": "tie rounding",
     "gate": "float against INT8, on patches that calibration did not see",
     "price": "what the DPU's restrictions cost, one more in each row",

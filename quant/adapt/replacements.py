@@ -21,8 +21,8 @@ And by another function again:
    (`quant.graph.attention`).
 7. Maps that are padded by reflection or by their edge are padded by zeros. The host mirrors the
    image beyond its borders and crops the result, so that the zeros lie outside of it.
-8. Bilinear enlargement with other centres becomes one with half-pixel centres. Aligned corners are
-   up to a quarter of a small pixel away.
+8. Bilinear enlargement by a power of two becomes enlargements by 4 and 2 with half-pixel centres.
+   Aligned corners are up to a quarter of a small pixel away.
 9. Bicubic enlargement of the image becomes a transposed convolution with the same weights. Where
    the original repeats the border of the image, the host mirrors it.
 
@@ -42,7 +42,7 @@ from beers_deploy.quant.graph.attention import aligned, shrinking
 from beers_deploy.quant.graph.base import REACH_PX, Base
 from beers_deploy.quant.graph.host_end import host_end
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
-from beers_deploy.quant.graph.resize import Resizing, alone_enlarges_image
+from beers_deploy.quant.graph.resize import Resizing, alone_enlarges_image, enlarged_bilinearly
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.activations_first import activations_first
 from beers_deploy.quant.simplify.fold_affine import (
@@ -68,7 +68,7 @@ class Kind(StrEnum):
     prelu = "PReLU"
     attention = "spatial attention (ESA)"
     padding = "reflecting padding"
-    centres = "bilinear enlargement with other centres"
+    bilinear = "other bilinear enlargement"
     cubic = "bicubic enlargement"
 
 
@@ -80,7 +80,7 @@ APPROXIMATIONS = {
     Kind.prelu: "LeakyReLU of 26/256",
     Kind.attention: "attention on an eighth of the sides",
     Kind.padding: "zeros around the mirrored image",
-    Kind.centres: "bilinear enlargement with half-pixel centres",
+    Kind.bilinear: "bilinear by 4 and 2 with half-pixel centres",
     Kind.cubic: "a transposed convolution of the mirrored image",
 }
 """The other function that replaces each kind (1 to 3, and 6 to 9)."""
@@ -110,7 +110,7 @@ def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
         Kind.attention: shrinking(graph, node),
         Kind.silu: silu_input(graph, node),
         Kind.padding: pads_of(graph, node),
-        Kind.centres: resizing is not None and resizing.is_nearly_bilinear,
+        Kind.bilinear: resizing is not None and resizing.is_nearly_bilinear,
         Kind.cubic: alone_enlarges_image(graph, node),
     }
     for kind, is_of_kind in kinds.items():
@@ -279,9 +279,9 @@ def _approximation(shapes: Shapes, graph: OnnxGraph, node: Node, kind: Kind) -> 
         return [Node.new("HardSigmoid", node.inputs, output, node.name, alpha=1 / 6, beta=0.5)]
     if kind is Kind.tanh:
         return _clipped_line(graph, node)
-    if kind is Kind.centres:
-        bilinear = {"mode": "linear", "coordinate_transformation_mode": "half_pixel"}
-        return [Node.new("Resize", node.inputs, output, node.name, **bilinear)]
+    if kind is Kind.bilinear:
+        factor = int(Resizing.of(node, graph).factors[2])
+        return enlarged_bilinearly(graph, node.inputs[0], factor, node)
     if kind is Kind.cubic:
         return _cubic_convolution(shapes, graph, node)
     return [Node.new("LeakyRelu", node.inputs[:1], output, node.name, alpha=LEAKY_SLOPE)]

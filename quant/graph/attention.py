@@ -10,9 +10,7 @@ That is another function. `quant.adapt` replaces the original by it, measures th
 compensates it.
 """
 
-import numpy as np
-
-from beers_deploy.quant.graph.resize import Resizing
+from beers_deploy.quant.graph.resize import Resizing, enlarged_bilinearly
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 
 BETWEEN = {"Conv", "LeakyRelu", "PRelu", "Relu"}
@@ -87,11 +85,4 @@ def aligned(graph: OnnxGraph, node: Node) -> dict[Node, list[Node]]:
         replacements[old] = [Node.new(old.op_type, inputs, result, old.name, **attributes)]
         source = result
     # 2.
-    inner = f"{node.outputs[0]}.quarter"
-    modes = {"mode": "linear", "coordinate_transformation_mode": "pytorch_half_pixel"}
-    enlarged = []
-    for factor, name, result in ((4, inner, inner), (2, node.name, node.outputs[0])):
-        scales = graph.add_constant(f"{result}.scales", np.array([1, 1, factor, factor]))
-        enlarged.append(Node.new("Resize", [source, "", scales], result, name, **modes))
-        source = result
-    return replacements | {node: enlarged}
+    return replacements | {node: enlarged_bilinearly(graph, source, 8, node)}

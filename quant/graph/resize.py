@@ -4,6 +4,8 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from beers_deploy.quant.graph.base import CUBIC
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 
@@ -73,10 +75,12 @@ class Resizing:
 
     @property
     def is_nearly_bilinear(self) -> bool:
-        """True if the bilinear enlargement of a DPU is near: this one has other centres, such as
-        those of aligned corners.
+        """True if bilinear enlargements by 4 and 2 with half-pixel centres, as a DPU has them, are
+        near: this one has other centres, such as those of aligned corners, or a larger power of 2.
         """
-        return self.mode == "linear" and not self.is_half_pixel and self.factors in BY_2_OR_4
+        by_2_or_4 = self.factors in BY_2_OR_4
+        is_power = by_2_or_4 or self.factors in ((1, 1, 8, 8), (1, 1, 16, 16), (1, 1, 32, 32))
+        return self.mode == "linear" and is_power and not (by_2_or_4 and self.is_half_pixel)
 
     def makes_blocks(self, factor: int) -> bool:
         """Return True if nearest interpolation turns each pixel into a block of `factor` x `factor`
@@ -89,6 +93,30 @@ class Resizing:
         place = PLACES[self.where]
         rounded = ROUNDINGS[self.rounding]
         return all(rounded(place(k, factor)) == k // factor for k in range(factor))
+
+
+def enlarged_bilinearly(graph: OnnxGraph, source: str, factor: int, node: Node) -> list[Node]:
+    """Return bilinear enlargements by 4 and 2 with half-pixel centres in place of a Resize.
+
+    Args:
+        graph: the graph that the Resize belongs to; its constants are extended.
+        source: the name of the map that they enlarge.
+        factor: the power of 2 by which rows and columns are enlarged.
+        node: the Resize, whose name and result the last one has.
+    """
+    modes = {"mode": "linear", "coordinate_transformation_mode": "pytorch_half_pixel"}
+    nodes: list[Node] = []
+    enlarged = 1
+    while enlarged < factor:
+        step = min(4, factor // enlarged)
+        enlarged *= step
+        is_last = enlarged == factor
+        result = node.outputs[0] if is_last else f"{node.outputs[0]}.{enlarged}"
+        scales = graph.add_constant(f"{result}.scales", np.array([1, 1, step, step]))
+        name = node.name if is_last else result
+        nodes.append(Node.new("Resize", [source, "", scales], result, name, **modes))
+        source = result
+    return nodes
 
 
 def enlarges_image(graph: OnnxGraph, node: Node) -> bool:
