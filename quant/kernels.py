@@ -151,8 +151,8 @@ def _move_relu_down(largest: dict[str, int], graph: OnnxGraph, node: Node) -> li
     middle = graph.value(node, 1) if node.op_type == "Max" and len(node.inputs) == 2 else None
     if middle is None or middle.dtype != np.uint8 or middle.size != 1:
         return None
-    result = node.outputs[0]
-    writer = graph.sole_writer(node.inputs[0])
+    result = node.result
+    writer = graph.sole_writer(node.source)
     place = REQUANTISING.get(writer.op_type) if writer else None
     if writer is None or place is None or not _holds(graph, writer, place, middle):
         return None
@@ -173,7 +173,7 @@ def _move_relu_down(largest: dict[str, int], graph: OnnxGraph, node: Node) -> li
     for reader in readers:
         _set_input(reader, OPERATORS[reader.op_type].zero, zero)
     end = _constant(graph, np.uint8(largest[result]))
-    return [Node.new("Min", [node.inputs[0], end], result, node.name)]
+    return [node.replaced_by("Min", [node.source, end])]
 
 
 def _holds(graph: OnnxGraph, node: Node, place: int, value: np.ndarray) -> bool:
@@ -202,7 +202,7 @@ def _add_exactly(largest: dict[str, int], graph: OnnxGraph, node: Node) -> list[
             "weights, but this processor needs constant ones. Store them as constants, or run the "
             "network on a processor with VNNI."
         )
-    activations_end = largest.get(node.inputs[0], UINT8_MAX)
+    activations_end = largest.get(node.source, UINT8_MAX)
     if weight.dtype != np.int8 or cannot_saturate(node.op_type, weight, activations_end):
         return None
     _lift(graph, node, places.weight, places.weight_zero)
@@ -211,17 +211,17 @@ def _add_exactly(largest: dict[str, int], graph: OnnxGraph, node: Node) -> list[
         return None
     # Signed activations are converted to uint8 before the node, and its result back behind it.
     _lift(graph, node, places.zero)
-    source = f"{node.inputs[0]}.unsigned"
+    source = f"{node.source}.unsigned"
     nodes = [node]
     # The activations are converted once for all their readers.
     if source not in graph.writers:
-        nodes = [*_moved(graph, node.inputs[0], MIDDLE, TensorProto.UINT8, source), node]
+        nodes = [*_moved(graph, node.source, MIDDLE, TensorProto.UINT8, source), node]
     _set_input(node, 0, source)
     if places.result_zero is not None:
         _lift(graph, node, places.result_zero)
-        result = node.outputs[0]
+        result = node.result
         node.outputs = (f"{result}.unsigned",)
-        nodes += _moved(graph, node.outputs[0], -MIDDLE, TensorProto.INT8, result)
+        nodes += _moved(graph, node.result, -MIDDLE, TensorProto.INT8, result)
     return nodes
 
 
@@ -239,7 +239,7 @@ def _add_dequantised(graph: OnnxGraph, node: Node) -> list[Node] | None:
     if cannot_saturate(FLOAT_OPERATORS[node.op_type], weight, UINT8_MAX):
         return None
     # A copy, because another node may read the same weights as int8.
-    name = f"{node.outputs[0]}.weight_from_uint8"
+    name = f"{node.result}.weight_from_uint8"
     lifted = Node.of(source.written())
     lifted.proto.name = name
     lifted.outputs = (name,)
@@ -265,8 +265,8 @@ def _moved(graph: OnnxGraph, source: str, by: int, kind: int, result: str) -> li
     # ONNX's Add of 8-bit integers would wrap around, so the sum is formed in int32.
     total = f"{result}.moved"
     return [
-        Node.new("Cast", [source], wide, wide, to=TensorProto.INT32),
-        Node.new("Add", [wide, _constant(graph, np.int32(by))], total, total),
+        Node.new("Cast", [source], wide, to=TensorProto.INT32),
+        Node.new("Add", [wide, _constant(graph, np.int32(by))], total),
         Node.new("Cast", [total], result, f"{result}.cast", to=kind),
     ]
 
@@ -311,15 +311,15 @@ def _widen(graph: OnnxGraph, node: Node) -> list[Node] | None:
     more_outputs = max(FEWEST_OUTPUTS - n_outputs, 0)
     nodes = [node]
     if more_inputs:
-        source = node.inputs[0]
+        source = node.source
         padded = f"{source}.padded"
         # Convolutions may share a widened input.
         if padded not in graph.writers:
             pads = _constant(graph, np.array([0, 0, 0, 0, 0, more_inputs, 0, 0]))
-            nodes = [Node.new("Pad", [source, pads], padded, padded), node]
+            nodes = [Node.new("Pad", [source, pads], padded), node]
         _set_input(node, 0, padded)
     if more_outputs:
-        result = node.outputs[0]
+        result = node.result
         node.outputs = (f"{result}.filled",)
         places = [_constant(graph, np.array([place])) for place in (0, n_outputs, 1)]
         nodes.append(Node.new("Slice", [*node.outputs, *places], result, f"{result}.cut"))

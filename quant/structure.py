@@ -165,9 +165,7 @@ def _rounded(graph: OnnxGraph, core: IntCore | None) -> list[Rounded]:
     host_part = core.host_part if core else ONE_CHANNEL
     counted = host_part.decoding.never_replaced(host_part.outputs)
     read_as = {
-        node.outputs[0]: node.inputs[0]
-        for node in graph.nodes
-        if node.op_type == "DequantizeLinear"
+        node.result: node.source for node in graph.nodes if node.op_type == "DequantizeLinear"
     }
     relus = set[str]()
     for node in graph.nodes:
@@ -177,13 +175,9 @@ def _rounded(graph: OnnxGraph, core: IntCore | None) -> list[Rounded]:
     relus |= {read_as[name] for name in relus & set(read_as)}
     tensors = []
     for node in graph.nodes:
-        name = node.outputs[0]
+        name = node.result
         scale = dict(stated(node, graph)).get(name)
-        if (
-            scale is not None
-            and scale.integer_type in BYTES
-            and node.inputs[0] not in graph.constants
-        ):
+        if scale is not None and scale.integer_type in BYTES and node.source not in graph.constants:
             tensors.append(
                 Rounded(name, scale, name in relus, counted if name == CORRECTION else slice(None))
             )
@@ -251,7 +245,7 @@ def count_relus(model: onnx.ModelProto) -> Relus:
         explicit = sum(_is_relu(node, graph, tensors) for node in nodes)
         folded = 0
         for node in graph.nodes:
-            value = tensors.get(node.outputs[0])
+            value = tensors.get(node.result)
             is_convolved = node.op_type == "QLinearConv" or convolved.intersection(node.inputs[:1])
             # All numbers of a convolution's result are at least zero.
             if value is not None and is_convolved:

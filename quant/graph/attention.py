@@ -30,10 +30,10 @@ def shrinking(graph: OnnxGraph, node: Node) -> list[Node]:
         and the Resize. The list is empty if the node is no Resize of an attention.
     """
     nodes: list[Node] = []
-    writer = _writer(graph, node.inputs[0]) if node.op_type == "Resize" else None
+    writer = _writer(graph, node.source) if node.op_type == "Resize" else None
     while writer is not None and (not nodes or nodes[0].op_type != "MaxPool"):
         nodes.insert(0, writer)
-        writer = _writer(graph, writer.inputs[0])
+        writer = _writer(graph, writer.source)
     if writer is None or not BETWEEN.issuperset(inner.op_type for inner in nodes[1:]):
         return []
     pool = nodes[0]
@@ -76,10 +76,10 @@ def aligned(graph: OnnxGraph, node: Node) -> dict[Node, list[Node]]:
     # 1. Pads put each value in the middle of the eight pixels that it stands for, or next to it.
     changes = {0: {"pads": [1, 1, 1, 1]}, 1: {"strides": [4, 4], "pads": [1, 1, 2, 2]}}
     replacements: dict[Node, list[Node]] = {}
-    source = nodes[0].inputs[0]
+    source = nodes[0].source
     for place, old in enumerate(nodes):
         # Another name, because it is not the tensor of the original any more.
-        result = f"{old.outputs[0]}.aligned"
+        result = f"{old.result}.aligned"
         attributes = {**old.attributes, **changes.get(place, {})}
         inputs = [source, *old.inputs[1:]]
         replacements[old] = [Node.new(old.op_type, inputs, result, old.name, **attributes)]

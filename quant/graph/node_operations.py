@@ -44,8 +44,8 @@ def require(condition: bool, node: Node, rule: str, remedy: str = REMEDY) -> Non
         raise unsupported(f"{node} {rule}.", remedy)
 
 
-def _weights(node: Node, graph: OnnxGraph) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights (O, I / groups, kh, kw) of a convolution, and its bias (O,)."""
+def _read_conv(node: Node, graph: OnnxGraph) -> Op:
+    """Read a convolution of one group or of one for each channel, or a transposed one."""
     weight = graph.value(node, 1)
     bias = graph.value(node, 2)
     if weight is None:
@@ -56,16 +56,13 @@ def _weights(node: Node, graph: OnnxGraph) -> tuple[np.ndarray, np.ndarray]:
         f"must be a convolution over rows and columns, but its weights have {weight.ndim} "
         "dimensions",
     )
-    if node.op_type == "ConvTranspose":
-        weight = np.ascontiguousarray(weight.swapaxes(0, 1))
-    bias = np.zeros(len(weight)) if bias is None else bias
-    return weight.astype(np.float32), bias.astype(np.float32)
-
-
-def _read_conv(node: Node, graph: OnnxGraph) -> Op:
-    """Read a convolution of one group, or of one for each channel."""
-    weight, bias = _weights(node, graph)
     groups = int(node.attributes.get("group", 1))
+    transposed = node.op_type == "ConvTranspose"
+    if transposed:
+        weight = np.ascontiguousarray(weight.swapaxes(0, 1))
+        # Simplification has made one group of several.
+        groups = 1
+        _check_transposed(node)
     # A DPU has one group or one a channel: its tools leave others to the processor.
     depthwise = groups == len(weight) and weight.shape[1] == 1
     require(
@@ -74,14 +71,21 @@ def _read_conv(node: Node, graph: OnnxGraph) -> Op:
         f"must have one group, or one for each channel (depthwise), got {groups} groups",
     )
     _, window = _window(node, weight.shape[2:])
+    bias = np.zeros(len(weight)) if bias is None else bias
     return Conv(
-        node.name, node.inputs[0], node.outputs[0], weight, bias, window=window, groups=groups
+        node.name,
+        node.source,
+        node.result,
+        weight.astype(np.float32),
+        bias.astype(np.float32),
+        window=window,
+        groups=groups,
+        transposed=transposed,
     )
 
 
-def _read_transposed_conv(node: Node, graph: OnnxGraph) -> Op:
-    """Read a transposed convolution that enlarges rows and columns by the same factor."""
-    weight, bias = _weights(node, graph)
+def _check_transposed(node: Node) -> None:
+    """Raise ModelError unless a transposed convolution enlarges rows and columns by one factor."""
     attribute = node.attributes.get
     strides = list(attribute("strides", [1, 1]))
     rule = f"must have one stride for rows and columns, got strides {strides}"
@@ -98,10 +102,6 @@ def _read_transposed_conv(node: Node, graph: OnnxGraph) -> Op:
         value = attribute(name, "NOTSET")
         rule = f"must have pads instead of {name} {value}"
         require(value == "NOTSET", node, rule, "State its pads.")
-    _, window = _window(node, weight.shape[2:])
-    return Conv(
-        node.name, node.inputs[0], node.outputs[0], weight, bias, window=window, transposed=True
-    )
 
 
 def _window(node: Node, kernel: Sequence[int] = ()) -> tuple[Pair, Window]:
@@ -119,13 +119,13 @@ def _read_concat(node: Node, graph: OnnxGraph) -> Op:
     require(axis in (1, -3), node, f"must concatenate along the channels, got axis {axis}")
     computed = graph.constants.keys().isdisjoint(node.inputs)
     require(computed, node, "must concatenate computed tensors, got a constant")
-    return Concat(node.name, node.inputs, node.outputs[0])
+    return Concat(node.name, node.inputs, node.result)
 
 
 def _read_max_pool(node: Node, _: OnnxGraph) -> Op:
     plain = len(node.outputs) == 1 and not node.attributes.get("ceil_mode", 0)
     require(plain, node, "must have one output and ceil_mode 0")
-    return MaxPool(node.name, node.inputs[0], node.outputs[0], *_window(node))
+    return MaxPool(node.name, node.source, node.result, *_window(node))
 
 
 def _read_average_pool(node: Node, _: OnnxGraph) -> Op:
@@ -133,7 +133,7 @@ def _read_average_pool(node: Node, _: OnnxGraph) -> Op:
     zeros = bool(node.attributes.get("count_include_pad", 0)) or not any(window.pads)
     plain = zeros and not node.attributes.get("ceil_mode", 0)
     require(plain, node, "must have count_include_pad 1 and ceil_mode 0")
-    return AveragePool(node.name, node.inputs[0], node.outputs[0], kernel, window)
+    return AveragePool(node.name, node.source, node.result, kernel, window)
 
 
 def _read_resize(node: Node, graph: OnnxGraph) -> Op:
@@ -166,7 +166,7 @@ def _read_resize(node: Node, graph: OnnxGraph) -> Op:
             f"{resizing.mode}, {where}, {resizing.rounding} by {factor}",
             ADAPT if alone_enlarges_image(graph, node) else REMEDY,
         )
-    return Resize(node.name, node.inputs[0], node.outputs[0], factor, resizing.mode == "linear")
+    return Resize(node.name, node.source, node.result, factor, resizing.mode == "linear")
 
 
 def _read_shuffle(node: Node, _: OnnxGraph) -> Op:
@@ -181,18 +181,16 @@ def _read_shuffle(node: Node, _: OnnxGraph) -> Op:
     block = int(node.attributes["blocksize"])
     # Of several nodes that spell one shuffle it is the last one's name.
     name = node.proto.name or node.name
-    return Shuffle(name, node.inputs[0], node.outputs[0], block, up, ORDERS[mode])
+    return Shuffle(name, node.source, node.result, block, up, ORDERS[mode])
 
 
 READERS: dict[str, Callable[[Node, OnnxGraph], Op]] = {
     "AveragePool": _read_average_pool,
     "Concat": _read_concat,
     "Conv": _read_conv,
-    "ConvTranspose": _read_transposed_conv,
+    "ConvTranspose": _read_conv,
     "DepthToSpace": _read_shuffle,
-    "GlobalAveragePool": lambda node, _: AveragePool(
-        node.name, node.inputs[0], node.outputs[0], None
-    ),
+    "GlobalAveragePool": lambda node, _: AveragePool(node.name, node.source, node.result, None),
     "MaxPool": _read_max_pool,
     "Resize": _read_resize,
     "SpaceToDepth": _read_shuffle,

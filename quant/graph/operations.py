@@ -318,10 +318,22 @@ def read_planes(graph: Graph, full_scale: np.ndarray | None = None) -> Graph:
         graph: a float graph that reads the image, by convolutions alone.
         full_scale: (C,) the value of each channel that is encoded as 1; None for 1.
     """
-    return tuple(
-        _reads_planes(op) if isinstance(op, Conv) and op.input == IMAGE else op
-        for op in fold_full_scale(graph, full_scale)
-    )
+    unit = np.float32(2.0**PLANES_FRAC_BITS / MAX_DN)
+    ops = list[Op]()
+    for op in fold_full_scale(graph, full_scale):
+        if isinstance(op, Conv) and op.input == IMAGE:
+            weight = op.weight
+            # Each result of a depthwise convolution reads several planes of its channel, which a
+            # depthwise one cannot, so it becomes an ordinary one with zeros for the other channels.
+            if op.groups != 1:
+                weight = weight * np.eye(op.groups, dtype=np.float32)[:, :, None, None]
+            # The third plane only makes the steps of the weights finer: in float it adds nothing.
+            planes = [weight * (STEP * unit), weight * unit, np.zeros_like(weight)]
+            weight = np.concatenate(planes, axis=1).astype(np.float32)
+            ops.append(replace(op, input=PLANES, weight=weight, groups=1))
+        else:
+            ops.append(op)
+    return tuple(ops)
 
 
 def fold_full_scale(graph: Graph, full_scale: np.ndarray | None) -> Graph:
@@ -346,17 +358,3 @@ def fold_full_scale(graph: Graph, full_scale: np.ndarray | None) -> Graph:
         else:
             scaled.append(op)
     return tuple(scaled)
-
-
-def _reads_planes(op: Conv) -> Conv:
-    unit = np.float32(2.0**PLANES_FRAC_BITS / MAX_DN)
-    weight = op.weight
-    # Each result of a depthwise convolution reads several planes of its channel, which a depthwise
-    # one cannot, so it becomes an ordinary one with zeros for the other channels.
-    if op.groups != 1:
-        weight = weight * np.eye(op.groups, dtype=np.float32)[:, :, None, None]
-    # The third plane only makes the steps of the weights finer: in float it adds nothing.
-    planes = [weight * (STEP * unit), weight * unit, np.zeros_like(weight)]
-    return replace(
-        op, input=PLANES, weight=np.concatenate(planes, axis=1).astype(np.float32), groups=1
-    )

@@ -47,30 +47,26 @@ def with_shuffles(model: onnx.ModelProto) -> OnnxGraph:
         model: any network; not changed.
     """
     graph = OnnxGraph(model)
-    chains = _chains(graph)
+    # Chains of nodes that only move pixels, each of which only the next one reads, by the last
+    # result.
+    chains: dict[str, list[Node]] = {}
+    for node in graph.nodes:
+        if node.op_type in MOVES:
+            chain = chains.pop(node.source, []) if graph.n_reads(node.source) == 1 else []
+            chain.append(node)
+            chains[node.result] = chain
     if not chains:
         return graph
     types = graph.tensor_types()
     # The last node of a chain stands for all of them, so that no reader of the result moves.
     replacements: dict[Node, list[Node]] = {}
-    for chain in chains:
-        sizes = sizes_of(types.get(chain[0].inputs[0], TypeProto.Tensor()))
+    for chain in chains.values():
+        sizes = sizes_of(types.get(chain[0].source, TypeProto.Tensor()))
         shuffle = _shuffle(chain, sizes, graph)
         if shuffle is not None:
             replacements |= {**{node: [] for node in chain}, chain[-1]: [shuffle]}
     graph.rewrite(lambda _, node: replacements.get(node))
     return graph
-
-
-def _chains(graph: OnnxGraph) -> list[list[Node]]:
-    """Return nodes that only move pixels, in chains of which only the next node reads each."""
-    chains: dict[str, list[Node]] = {}  # by the last result
-    for node in graph.nodes:
-        if node.op_type in MOVES:
-            chain = chains.pop(node.inputs[0], []) if graph.n_reads(node.inputs[0]) == 1 else []
-            chain.append(node)
-            chains[node.outputs[0]] = chain
-    return list(chains.values())
 
 
 def _shuffle(chain: list[Node], sizes: tuple[int, ...], graph: OnnxGraph) -> Node | None:
@@ -90,23 +86,18 @@ def _shuffle(chain: list[Node], sizes: tuple[int, ...], graph: OnnxGraph) -> Nod
             continue
         up = growth > 1
         block = max(growth.numerator, growth.denominator)
-        mode = _order(image, result, block, up) if block > 1 else ""
+        mode = ""
+        for order, columns_first in ORDERS.items():
+            shuffle = Shuffle("", "", "", block, up, columns_first)
+            if block > 1 and not mode and np.array_equal(shuffle(image), result):
+                mode = order
         kind = "DepthToSpace" if up else "SpaceToDepth"
         # Messages name the first node of the chain, and files that we write the last one.
         last = chain[-1]
-        node = Node.new(kind, chain[0].inputs[:1], last.outputs[0], last.name, blocksize=block)
+        node = Node.new(kind, chain[0].inputs[:1], last.result, last.name, blocksize=block)
         attributes = {"blocksize": block, "mode": mode}
         return replace(node, name=chain[0].name, attributes=attributes)
     return None
-
-
-def _order(image: np.ndarray, result: np.ndarray, block: int, up: bool) -> str:
-    """Return the mode of a pixel shuffle that makes the result of the image; empty if none does."""
-    for mode, columns_first in ORDERS.items():
-        shuffle = Shuffle("", "", "", block, up, columns_first)
-        if np.array_equal(shuffle(image), result):
-            return mode
-    return ""
 
 
 def _moved(chain: list[Node], image: np.ndarray, graph: OnnxGraph) -> np.ndarray:

@@ -4,7 +4,7 @@ accept.
 
 import onnx
 
-from beers_deploy.quant.graph.operations import IMAGE, Activation, Add, Conv, Graph, Op, same
+from beers_deploy.quant.graph.operations import IMAGE, Activation, Add, Conv, Graph, same
 from beers_deploy.quant.graph.reader import read_network
 from beers_deploy.quant.graph.split_network import SplitNetwork, unsupported
 
@@ -36,19 +36,17 @@ def correction_graph(model: onnx.ModelProto) -> Graph:
             "(a global add)."
         )
     for op in network.graph:
-        if not _is_plain(op):
+        if isinstance(op, Conv):
+            alone = op.groups == 1 and not op.transposed and op.window == same(op.weight)
+            is_plain = alone and op.activation in (Activation.none, Activation.relu)
+        else:
+            is_plain = isinstance(op, Add) and op.activation is Activation.none
+        if not is_plain:
             raise unsupported(
                 "The network may have only same-size convolutions of stride 1, ReLU and adds, but "
                 f"it has {op.name}."
             )
     return network.graph
-
-
-def _is_plain(op: Op) -> bool:
-    if isinstance(op, Conv):
-        alone = op.groups == 1 and not op.transposed and op.window == same(op.weight)
-        return alone and op.activation in (Activation.none, Activation.relu)
-    return isinstance(op, Add) and op.activation is Activation.none
 
 
 def image_channels(graph: Graph) -> int:

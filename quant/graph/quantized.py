@@ -73,7 +73,7 @@ def stated(node: Node, graph: OnnxGraph) -> Iterator[tuple[str, Scale]]:
     if node.op_type == "QLinearConcat":
         places = {RESULT: (0, 1)} | {i: (i + 1, i + 2) for i in range(2, len(node.inputs), 3)}
     for place, (scale, zero_point) in places.items():
-        name = node.outputs[0] if place == RESULT else node.inputs[place]
+        name = node.result if place == RESULT else node.inputs[place]
         scales = graph.constants.get(node.inputs[scale], np.zeros(0))
         zeros = graph.value(node, zero_point)
         # A missing zero point is 0. Its type is that of the constant, that of `output_dtype`, or
@@ -122,7 +122,13 @@ class Integers:
         self._formats: dict[str, tuple[Scale, ...]] = {}
         self._becomes = self._rounded()
         for node in graph.nodes:
-            self._read_formats(node)
+            # The format of a constant is that of its reader, because two nodes may read the same
+            # bytes at two scales.
+            for name, scale in stated(node, graph):
+                if name not in self._constants:
+                    self._give(self.resolve(name), scale)
+                elif node.op_type == "DequantizeLinear":
+                    self._give(node.result, scale)
             self._follow(node)
 
     def resolve(self, name: str) -> str:
@@ -163,7 +169,7 @@ class Integers:
         """Return True if the file computes a node on integers, by integer kernels or between Q/DQ
         nodes.
         """
-        return node.outputs[0] in self._int8 or node.outputs[0] in self._wide
+        return node.result in self._int8 or node.result in self._wide
 
     def is_notation(self, node: Node) -> bool:
         """Return True if a node computes nothing, and only defines how the integers that it reads
@@ -171,7 +177,7 @@ class Integers:
 
         A DequantizeLinear in front of an integer operation is an example.
         """
-        result = node.outputs[0]
+        result = node.result
         if node.op_type == "DequantizeLinear" and result not in self._same:
             readers = self._graph.readers.get(result, [])
             return result not in self._results and all(map(self.is_integer, readers))
@@ -205,16 +211,18 @@ class Integers:
             "weight", "bias", "constant 1" and "output". If the file contradicts itself, a tensor
             has several formats, that of its writer first. It has none if the file states none.
         """
+        formats: dict[str, tuple[Scale, ...]] = {}
+        if self.is_integer(node):
+            tensors = {f"input {i}": name for i, name in enumerate(self.activations(node))}
+            result = node.result
+            tensors["output"] = result if result in self._int8 else self._becomes[result]
+            for role, name in tensors.items():
+                formats[role] = self._formats.get(self.resolve(name), ())
         stated_scales = dict(stated(node, self._graph))
-        numbers = self._numbers(node)
-        formats = {
-            role: self._formats.get(self.resolve(name), ())
-            for role, name in self._tensors(node).items()
-        }
-        return formats | {
-            role: (stated_scales[n],) if n in stated_scales else self._formats.get(n, ())
-            for role, n in numbers.items()
-        }
+        for role, name in self._numbers(node).items():
+            stored = self._formats.get(name, ())
+            formats[role] = (stated_scales[name],) if name in stated_scales else stored
+        return formats
 
     def numbers(self, node: Node) -> dict[str, np.ndarray | None]:
         """Return the constants that a node reads, in the integers that the file stores.
@@ -231,14 +239,6 @@ class Integers:
     def _operands(self, node: Node) -> tuple[str, ...]:
         default = slice(0, 1) if node.op_type.startswith("QLinear") else slice(None)
         return node.inputs[OPERANDS.get(node.op_type, default)]
-
-    def _tensors(self, node: Node) -> dict[str, str]:
-        """Return the activations that an integer node reads and writes, by role."""
-        if not self.is_integer(node):
-            return {}
-        inputs = {f"input {i}": name for i, name in enumerate(self.activations(node))}
-        result = node.outputs[0]
-        return inputs | {"output": result if result in self._int8 else self._becomes[result]}
 
     def _numbers(self, node: Node) -> dict[str, str]:
         """Return the names of an integer node's operands other than activations, by role."""
@@ -260,8 +260,13 @@ class Integers:
 
     def _follow(self, node: Node) -> None:
         """Determine the kind of a node's results from the kinds of its inputs."""
-        source = node.inputs[0] if node.inputs else ""
-        result = node.outputs[0]
+        source = node.source
+        result = node.result
+        if node.op_type == "Cast":
+            writes_int8 = node.attributes.get("to") in BYTES
+        else:
+            rounds = node.op_type in FORMATS or node.op_type == "QLinearConcat"
+            writes_int8 = rounds or self._reads(node, self._int8)
         if node.op_type == "DequantizeLinear":
             aliases = self._dequantised if self.constant(source) is None else self._same
             # At once, because each reader would walk a chain of aliases again.
@@ -270,7 +275,7 @@ class Integers:
             self._int8.add(result)
             self._same[result] = self.resolve(source)
             self._give(source, self._formats[result][0])
-        elif self._writes_int8(node):
+        elif writes_int8:
             self._int8.update(node.outputs)
             if result not in self._formats and source in self._formats:
                 self._give(result, self._formats[source][0])
@@ -280,12 +285,6 @@ class Integers:
             and self._reads(node, self._wide, self._dequantised)
         ):
             self._wide.update(node.outputs)
-
-    def _writes_int8(self, node: Node) -> bool:
-        if node.op_type == "Cast":
-            return node.attributes.get("to") in BYTES
-        rounds = node.op_type in FORMATS or node.op_type == "QLinearConcat"
-        return rounds or self._reads(node, self._int8)
 
     def _reads(self, node: Node, *tensors: Container[str]) -> bool:
         """Return True if a node reads at least one tensor, and all of its tensors are in the
@@ -303,27 +302,15 @@ class Integers:
         """
         int8_names: dict[str, str] = {}
         for node in reversed(self._graph.nodes):
-            readers = self._graph.readers.get(node.outputs[0], [])
+            readers = self._graph.readers.get(node.result, [])
             kinds = {reader.op_type for reader in readers}
-            if node.outputs[0] in self._results or not kinds:
+            if node.result in self._results or not kinds:
                 continue
             if kinds == {"QuantizeLinear"}:
-                int8_names[node.outputs[0]] = readers[0].outputs[0]
-            elif len(readers) == 1 and kinds <= ACTIVATIONS and readers[0].outputs[0] in int8_names:
-                int8_names[node.outputs[0]] = int8_names[readers[0].outputs[0]]
+                int8_names[node.result] = readers[0].result
+            elif len(readers) == 1 and kinds <= ACTIVATIONS and readers[0].result in int8_names:
+                int8_names[node.result] = int8_names[readers[0].result]
         return int8_names
-
-    def _read_formats(self, node: Node) -> None:
-        """Record the formats that a node states.
-
-        The format of a constant is that of its reader, because two nodes may read the same bytes at
-        two scales.
-        """
-        for name, scale in stated(node, self._graph):
-            if name not in self._constants:
-                self._give(self.resolve(name), scale)
-            elif node.op_type == "DequantizeLinear":
-                self._give(node.outputs[0], scale)
 
     def _give(self, tensor: str, scale: Scale) -> None:
         scales = self._formats.get(tensor, ())

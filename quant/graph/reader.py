@@ -132,7 +132,6 @@ class _Reader:
         self.source = with_shuffles(self._aligned(model))
         self.image, *_ = self.source.inputs
         self.ops: list[Op] = []
-        self._places: dict[str, int] = {}  # where the operation that writes a tensor stands
         self.border_px = self._take_mirror()
         self.end = host_end(self.source)
 
@@ -164,14 +163,14 @@ class _Reader:
         others = [node for node in source.readers[self.image] if node not in pads]
         # The host adds the image, or enlarges it.
         is_of_host = all(n.op_type == "Add" or enlarges_image(source, n) for n in others)
-        is_mirror = len(pads) == 1 and pads[0].inputs[0] == self.image and is_of_host
+        is_mirror = len(pads) == 1 and pads[0].source == self.image and is_of_host
         if not is_mirror or pads[0].attributes.get("mode") != "reflect":
             return 0
         amounts = source.numbers(pads[0], 1, "pads") or [0]
         border_px = int(amounts[-1])
         if amounts != [0, 0, border_px, border_px] * 2 or border_px < 1:
             return 0
-        mirrored = pads[0].outputs[0]
+        mirrored = pads[0].result
         for node in source.readers[mirrored]:
             node.inputs = tuple(self.image if n == mirrored else n for n in node.inputs)
         source.set_nodes([node for node in source.nodes if node is not pads[0]])
@@ -192,14 +191,14 @@ class _Reader:
         (result,) = self.source.outputs
         result = self.end.in_core(result)
         for node in self.source.nodes:
-            if node.outputs[0] in self.end.replaced:
+            if node.result in self.end.replaced:
                 continue
             node.inputs = tuple(map(self.end.in_core, node.inputs))
             try:
                 self._read(node)
             except AdaptableError as error:
                 self.adaptable = self.adaptable or error
-                self._append(_stand_in(node, self.source))
+                self.ops.append(_stand_in(node, self.source))
         if not self.ops or self.ops[-1].output != result:
             raise unsupported("No operation writes the network's output.")
         graph = named_apart(self.ops, {self.image: IMAGE, result: CORRECTION})
@@ -229,11 +228,9 @@ class _Reader:
                 NO_IMAGE,
             )
         for node in self.source.nodes:
-            if REMEDIES.get(node.op_type) in (NORMALISES, STATISTICS):
+            if node.op_type == "Pad" or REMEDIES.get(node.op_type) in (NORMALISES, STATISTICS):
                 raise _refused(node, self.source)
-            if node.op_type == "Pad":
-                raise _refused(node, self.source)
-            if node.op_type == "Resize" and node.outputs[0] not in self.end.replaced:
+            if node.op_type == "Resize" and node.result not in self.end.replaced:
                 with suppress(AdaptableError):
                     READERS[node.op_type](node, self.source)
 
@@ -243,25 +240,21 @@ class _Reader:
         elif node.op_type in ("Add", "Div", "Mul", "Sub"):
             self._arithmetic(node)
         elif node.op_type in READERS:
-            self._append(READERS[node.op_type](node, self.source))
+            self.ops.append(READERS[node.op_type](node, self.source))
         else:
             raise _refused(node, self.source)
-
-    def _append(self, op: Op) -> None:
-        self._places[op.output] = len(self.ops)
-        self.ops.append(op)
 
     def _arithmetic(self, node: Node) -> None:
         """Append a sum, difference or product of two tensors, or of one with constants."""
         if any(self.source.value(node, place) is not None for place in (0, 1)):
-            self._append(self._by_constant(node))
+            self.ops.append(self._by_constant(node))
             return
-        inputs = node.inputs[0], node.inputs[1]
+        inputs = node.source, node.inputs[1]
         require(node.op_type != "Div", node, "must divide by a constant, not by a computed tensor")
         # Simplification has made an Add of a Sub whose channels are known.
         require(node.op_type != "Sub", node, "subtracts a map of unknown channels")
         kind = Mul if node.op_type == "Mul" else Add
-        self._append(kind(node.name, inputs, node.outputs[0]))
+        self.ops.append(kind(node.name, inputs, node.result))
 
     def _by_constant(self, node: Node) -> Op:
         """Read arithmetic with one number a channel as a depthwise convolution of one pixel."""
@@ -284,36 +277,43 @@ class _Reader:
             for values in (affine.scale, affine.shift)
         )
         weight = scale[:, None, None, None]
-        return Conv(node.name, source, node.outputs[0], weight, shift, groups=channels)
+        return Conv(node.name, source, node.result, weight, shift, groups=channels)
 
     def _activation(self, node: Node) -> None:
         """Fuse an activation into the operation before it, or append it as a separate operation."""
         activation = read_activation(node, self.source)
+        source = node.source
+        (output,) = node.outputs
+        written = [op.output for op in self.ops]
+        place = written.index(source) if source in written else None
+        producer = None if place is None else self.ops[place]
         # HardSigmoid and HardSwish are functions of a rounded value, the others of the exact sums.
-        on_sums = activation not in (Activation.hard_sigmoid, Activation.hard_swish)
-        source = node.inputs[0]
-        place = self._places.get(source, -1)
-        producer = self.ops[place] if place >= 0 else None
+        excluded = {Activation.hard_sigmoid, Activation.hard_swish}
+        if isinstance(producer, Add):
+            # A DPU computes no activation but ReLU behind a sum of two tensors.
+            excluded = set(Activation) - {Activation.relu}
+        elif isinstance(producer, Conv) and producer.transposed:
+            # The host computes LeakyReLU on a convolution's own sums, which a transposed one has in
+            # phases.
+            excluded.add(Activation.leaky_relu)
         if (
-            on_sums
+            place is not None
             and isinstance(producer, Conv | Add)
             and producer.activation is Activation.none
             and self.source.n_reads(source) == 1
-            and _fuses(producer, activation)
+            and activation not in excluded
         ):
-            (output,) = node.outputs
             self.ops[place] = replace(producer, output=output, activation=activation)
-            self._places[output] = self._places.pop(source)
         else:
-            self._append(Pointwise(node.name, source, node.outputs[0], activation))
+            self.ops.append(Pointwise(node.name, source, output, activation))
 
 
 def _stand_in(node: Node, graph: OnnxGraph) -> Op:
     """Return an operation in place of a node that can be adapted, so that the rest is read."""
-    source, result = node.inputs[0], node.outputs[0]
     if node.op_type == "Resize":
-        return Resize(node.name, source, result, int(Resizing.of(node, graph).factors[2]), True)
-    return Pointwise(node.name, source, result, Activation.hard_sigmoid)
+        factor = int(Resizing.of(node, graph).factors[2])
+        return Resize(node.name, node.source, node.result, factor, True)
+    return Pointwise(node.name, node.source, node.result, Activation.hard_sigmoid)
 
 
 def _refused(node: Node, graph: OnnxGraph) -> ModelError:
@@ -323,17 +323,8 @@ def _refused(node: Node, graph: OnnxGraph) -> ModelError:
     if is_mean and any(other.op_type == "Sqrt" for other in graph.nodes):
         remedy = f"It begins a layer normalization. {NORMALISES}"
     if node.op_type == "Softplus" and all(
-        reader.op_type == "Tanh" for reader in graph.readers[node.outputs[0]]
+        reader.op_type == "Tanh" for reader in graph.readers[node.result]
     ):
         # A part of Mish.
         remedy = ADAPT
     return unsupported(f"The DPU does not compute the operation {node}.", remedy)
-
-
-def _fuses(producer: Conv | Add, activation: Activation) -> bool:
-    """Return True if a DPU computes an activation on the sums of an operation."""
-    # A DPU computes no activation but ReLU behind a sum of two tensors.
-    if isinstance(producer, Add):
-        return activation is Activation.relu
-    # The host computes LeakyReLU on a convolution's own sums, which a transposed one has in phases.
-    return not (producer.transposed and activation is Activation.leaky_relu)

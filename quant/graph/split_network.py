@@ -148,7 +148,10 @@ def cut(graph: Graph, channels: int, with_sum: bool = True) -> SplitNetwork:
         back = last
         last = ()
     front: list[Shuffle] = []
-    while isinstance(first := _only_reader(graph), Shuffle) and not first.up:
+    while len(readers := [op for op in graph if IMAGE in op.inputs]) == 1:
+        (first,) = readers
+        if not isinstance(first, Shuffle) or first.up:
+            break
         front.append(first)
         graph = tuple(renamed(op, {first.output: IMAGE}) for op in graph if op is not first)
     network = SplitNetwork(graph, channels, tuple(front), back, adds_image, last)
@@ -188,11 +191,6 @@ def _ended(graph: Graph, name: str) -> Graph:
             f"shuffles, but none writes {name!r}."
         )
     return tuple(renamed(op, {name: CORRECTION}) for op in graph)
-
-
-def _only_reader(graph: Graph) -> Op | None:
-    readers = [op for op in graph if IMAGE in op.inputs]
-    return readers[0] if len(readers) == 1 else None
 
 
 def renamed(op: Op, names: Mapping[str, str]) -> Op:
@@ -288,22 +286,17 @@ def _sizes(graph: Graph, size: Pair) -> dict[str, Pair]:
     """Return the size of every tensor for images of one size."""
     sizes = {IMAGE: size}
     for op in graph:
-        sizes[op.output] = _size(op, _input_size(op, sizes))
+        input_sizes = [sizes[name] for name in op.inputs]
+        # Squeeze and excite: a factor for each channel, of one pixel, times a map.
+        is_gate = isinstance(op, Mul) and (1, 1) in input_sizes
+        if not is_gate and len(set(input_sizes)) > 1:
+            unequal = " and ".join(map(times, input_sizes))
+            raise unsupported(
+                f"{op.name} needs tensors of one size, but for an image of {times(size)} they have "
+                f"{unequal} pixels."
+            )
+        sizes[op.output] = _size(op, max(input_sizes))
     return sizes
-
-
-def _input_size(op: Op, sizes: Mapping[str, Pair]) -> Pair:
-    """Return the size that all tensors have that an operation reads."""
-    input_sizes = [sizes[name] for name in op.inputs]
-    # Squeeze and excite: a factor for each channel, of one pixel, times a map.
-    is_gate = isinstance(op, Mul) and (1, 1) in input_sizes
-    if not is_gate and len(set(input_sizes)) > 1:
-        unequal = " and ".join(map(times, input_sizes))
-        raise unsupported(
-            f"{op.name} needs tensors of one size, but for an image of {times(sizes[IMAGE])} they "
-            f"have {unequal} pixels."
-        )
-    return max(input_sizes)
 
 
 WHOLE_PX = 64 * 3 * 5 * 7

@@ -62,7 +62,12 @@ class Node:
 
     @classmethod
     def new(
-        cls, op_type: str, inputs: Sequence[str], output: str, name: str, **attributes: Any
+        cls,
+        op_type: str,
+        inputs: Sequence[str],
+        output: str,
+        name: str | None = None,
+        **attributes: Any,
     ) -> "Node":
         """Build a node that writes one tensor.
 
@@ -70,10 +75,31 @@ class Node:
             op_type: an operator of ONNX.
             inputs: the names of the tensors that it reads.
             output: the name of the tensor that it writes.
-            name: the name of the node.
+            name: the name of the node; None for that of the tensor.
             attributes: the attributes of the operator.
         """
+        name = output if name is None else name
         return cls.of(helper.make_node(op_type, inputs, [output], name, **attributes))
+
+    def replaced_by(self, op_type: str, inputs: Sequence[str], **attributes: Any) -> "Node":
+        """Build a node of the same name and result, with another operator or other inputs.
+
+        Args:
+            op_type: an operator of ONNX.
+            inputs: the names of the tensors that it reads.
+            attributes: the attributes of the operator.
+        """
+        return Node.new(op_type, inputs, self.result, self.name, **attributes)
+
+    @property
+    def source(self) -> str:
+        """The first tensor that it reads; empty if it reads none."""
+        return self.inputs[0] if self.inputs else ""
+
+    @property
+    def result(self) -> str:
+        """The first tensor that it writes."""
+        return self.outputs[0]
 
     def __str__(self) -> str:
         return f"{self.op_type} {self.name}"

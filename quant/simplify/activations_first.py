@@ -74,16 +74,16 @@ def behind_convolutions(model: onnx.ModelProto) -> onnx.ModelProto:
     shapes = float_shapes(graph)
 
     def with_copy(graph: OnnxGraph, node: Node) -> list[Node] | None:
-        source = node.inputs[0] if node.inputs else ""
+        source = node.source
         channels = channels_in(shapes, source)
         if not channels or not _lacks_convolution(graph, node):
             return None
-        copy = f"{node.outputs[0]}.copy"
+        copy = f"{node.result}.copy"
         ones = np.ones((channels, 1, 1, 1))
         inputs = [copy, *node.inputs[1:]]
         return [
             graph.convolution(source, copy, copy, ones, group=channels),
-            Node.new(node.op_type, inputs, node.outputs[0], node.name, **node.attributes),
+            node.replaced_by(node.op_type, inputs, **node.attributes),
         ]
 
     graph.rewrite(with_copy)
@@ -94,10 +94,10 @@ def behind_convolutions(model: onnx.ModelProto) -> onnx.ModelProto:
 
 def _lacks_convolution(graph: OnnxGraph, node: Node) -> bool:
     """Return True for an activation or an inner pixel shuffle that no convolution precedes."""
-    before = graph.writers.get(node.inputs[0]) if node.op_type in MAY_FOLLOW else None
-    if before is None or node.outputs[0] in graph.outputs:
+    before = graph.writers.get(node.source) if node.op_type in MAY_FOLLOW else None
+    if before is None or node.result in graph.outputs:
         return False
-    readers = {reader.op_type for reader in graph.readers[node.outputs[0]]}
+    readers = {reader.op_type for reader in graph.readers[node.result]}
     if node.op_type == "DepthToSpace" and readers <= HOST:
         return False
     # The sum with a constant becomes part of the convolution.
@@ -120,25 +120,25 @@ def move_in_front(graph: OnnxGraph, node: Node) -> list[Node] | None:
         The activations of what the operation reads, and the operation. None if the node is no
         activation, or does not lead through such operations to convolutions.
     """
-    moving = graph.sole_writer(node.inputs[0]) if node.op_type in ACTIVATIONS else None
+    moving = graph.sole_writer(node.source) if node.op_type in ACTIVATIONS else None
     # The host clips the result.
-    is_end = node.op_type == "Clip" and node.outputs[0] in graph.outputs
+    is_end = node.op_type == "Clip" and node.result in graph.outputs
     if moving is None or is_end or not _leads_to_convolutions(graph, node, moving):
         return None
     activations = [
         Node.new(
             node.op_type,
             (source, *node.inputs[1:]),
-            f"{node.outputs[0]}.{place}",
+            f"{node.result}.{place}",
             f"{node.name}.{place}" if place else node.name,
             **node.attributes,
         )
         for place, source in enumerate(_values(moving))
     ]
-    results = [activation.outputs[0] for activation in activations]
+    results = [activation.result for activation in activations]
     others = moving.inputs[len(results) :]
     moved = Node.new(
-        moving.op_type, (*results, *others), node.outputs[0], moving.name, **moving.attributes
+        moving.op_type, (*results, *others), node.result, moving.name, **moving.attributes
     )
     return [*activations, moved]
 

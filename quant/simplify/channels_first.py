@@ -39,24 +39,24 @@ def channels_first(model: onnx.ModelProto) -> None:
     network = deepcopy(model)
     graph = OnnxGraph(network)
     for name in graph.inputs:
-        first = Node.new("Transpose", [name], f"{name}.last", f"{name}.last", perm=TO_LAST)
+        first = Node.new("Transpose", [name], f"{name}.last", perm=TO_LAST)
         for node in graph.readers[name]:
-            node.inputs = tuple(first.outputs[0] if each == name else each for each in node.inputs)
+            node.inputs = tuple(first.result if each == name else each for each in node.inputs)
         graph.set_nodes([first, *graph.nodes])
     graph.rewrite(_moved_behind)
     graph.save()
     ends = [node for node in graph.nodes if _is_transpose(node, TO_LAST)]
-    if any(node.outputs[0] not in graph.outputs for node in ends):
+    if any(node.result not in graph.outputs for node in ends):
         # The image has its channels first.
         graph = OnnxGraph(model)
         graph.rewrite(_moved_behind)
         graph.save()
         return
-    results = [node.outputs[0] for node in ends]
+    results = [node.result for node in ends]
 
     def without(_: OnnxGraph, node: Node) -> list[Node] | None:
-        is_end = node.outputs[0] in results
-        return [Node.new("Identity", node.inputs, node.outputs[0], node.name)] if is_end else None
+        is_end = node.result in results
+        return [node.replaced_by("Identity", node.inputs)] if is_end else None
 
     graph.rewrite(without)
     graph.save()
@@ -74,7 +74,7 @@ def _moved_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
     names = [name for name in node.inputs if name and name not in graph.constants]
     writers = [graph.writers.get(name) for name in names]
     sources = {
-        writer.outputs[0]: writer.inputs[0]
+        writer.result: writer.source
         for writer in writers
         if writer is not None and _is_transpose(writer, TO_LAST)
     }
@@ -82,7 +82,7 @@ def _moved_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
         return None
     (result,) = node.outputs
     if _is_transpose(node, TO_FIRST):
-        return [Node.new("Identity", [*sources.values()], result, node.name)]
+        return [node.replaced_by("Identity", [*sources.values()])]
     first = f"{result}.first"
     moved = _on_first(graph, node, sources, first)
     if moved is None:
@@ -102,7 +102,7 @@ def _on_first(graph: OnnxGraph, node: Node, sources: Mapping[str, str], first: s
     """
     kind = node.op_type
     attributes = dict(node.attributes)
-    source = sources.get(node.inputs[0], "")
+    source = sources.get(node.source, "")
     number = graph.value(node, 1)
     if kind == "MatMul" and number is not None and number.ndim == 2:
         return graph.convolution(source, first, node.name, number.T[:, :, None, None])

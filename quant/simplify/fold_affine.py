@@ -57,7 +57,7 @@ def add_negated(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | No
     is_of_maps = graph.constants.keys().isdisjoint(node.inputs)
     if node.op_type != "Sub" or not is_of_maps or node.inputs[1] not in shapes:
         return None
-    result = node.outputs[0]
+    result = node.result
     before = graph.sole_writer(node.inputs[1])
     if before is not None and is_convolution(graph, before):
         # At once, so that the tensor keeps its name.
@@ -66,8 +66,8 @@ def add_negated(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | No
     name = f"{result}.negated"
     factor = graph.add_constant(f"{name}.factor", np.array(-1))
     return [
-        Node.new("Mul", [node.inputs[1], factor], name, name),
-        Node.new("Add", [node.inputs[0], name], result, node.proto.name),
+        Node.new("Mul", [node.inputs[1], factor], name),
+        Node.new("Add", [node.source, name], result, node.proto.name),
     ]
 
 
@@ -93,7 +93,7 @@ def fold_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
     if affine.channels not in (1, _width(graph, before)):
         return None
     _fold(graph, before, affine, into_results=True)
-    graph.rename(source, node.outputs[0])
+    graph.rename(source, node.result)
     return []
 
 
@@ -107,7 +107,7 @@ def fold_in_front(graph: OnnxGraph, shapes: Shapes) -> None:
     """
     folded = set[Node]()
     for node in graph.nodes[::-1]:
-        result = node.outputs[0]
+        result = node.result
         match = affine_of(graph, node)
         behind = list(dict.fromkeys(graph.readers.get(result, [])))
         if match is None or not behind or result in graph.outputs:
@@ -149,13 +149,13 @@ def convolve_affine(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] 
     source, affine = match
     width = max(channels, affine.channels)
     # A GELU or Swish is recognised by its parts.
-    is_part = any(reader.op_type in PARTS for reader in graph.readers[node.outputs[0]])
+    is_part = any(reader.op_type in PARTS for reader in graph.readers[node.result])
     is_lacking = node.op_type in LACKING and not (is_part and node.op_type == "Div")
     if channels not in (1, width) or not (is_lacking or width > channels):
         return None
     weight, shift = (np.broadcast_to(values, width) for values in (affine.scale, affine.shift))
     weight = weight.reshape(-1, 1, 1, 1)
-    return [graph.convolution(source, node.outputs[0], node.name, weight, shift, group=channels)]
+    return [graph.convolution(source, node.result, node.name, weight, shift, group=channels)]
 
 
 def affine_of(graph: OnnxGraph, node: Node) -> tuple[str, Affine] | None:
@@ -175,7 +175,7 @@ def affine_of(graph: OnnxGraph, node: Node) -> tuple[str, Affine] | None:
     if node.op_type == NORMALISATION:
         return _normalisation(graph, node)
     if node.op_type == "Neg":
-        return node.inputs[0], Affine(-np.ones(1), np.zeros(1))
+        return node.source, Affine(-np.ones(1), np.zeros(1))
     if node.op_type not in ("Add", "Div", "Mul", "Sub"):
         return None
     for place in (0, 1):
@@ -228,7 +228,7 @@ def _normalisation(graph: OnnxGraph, node: Node) -> tuple[str, Affine] | None:
         return None
     gain, offset, mean, variance = values
     scale = gain / np.sqrt(variance + node.attributes.get("epsilon", 1e-5))
-    return node.inputs[0], Affine(scale, offset - mean * scale)
+    return node.source, Affine(scale, offset - mean * scale)
 
 
 def per_channel(value: np.ndarray | None) -> np.ndarray | None:
@@ -280,10 +280,10 @@ def _weights(graph: OnnxGraph, node: Node) -> tuple[np.ndarray, np.ndarray]:
 
 def _set_weights(graph: OnnxGraph, node: Node, weight: np.ndarray, bias: np.ndarray) -> None:
     """Give a convolution weights and a bias of its own: the old ones may serve others too."""
-    name = node.proto.name or node.outputs[0]
+    name = node.proto.name or node.result
     numbers = {"weight": weight, "bias": bias}
     names = [graph.add_constant(f"{name}.{role}", value) for role, value in numbers.items()]
-    node.inputs = (node.inputs[0], *names)
+    node.inputs = (node.source, *names)
 
 
 def _fold(graph: OnnxGraph, node: Node, affine: Affine, into_results: bool) -> None:

@@ -145,9 +145,9 @@ def _sized(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
     Returns:
         The nodes with the same result; None if the node stays.
     """
-    source = node.inputs[0] if node.inputs else ""
+    source = node.source
     before = sizes.get(source, ())
-    after = sizes.get(node.outputs[0], ())
+    after = sizes.get(node.result, ())
     if node.op_type == "Transpose" or (node.op_type in RESHAPING and before != after):
         return rearranged(graph, node, sizes)
     if len(before) != 4 or len(after) != 4 or min(*before, *after) < 1:
@@ -161,19 +161,19 @@ def _sized(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
     )
     adds_nothing = node.op_type == "Pad" and graph.numbers(node, 1, "pads") == [0] * 8
     if keeps_all or adds_nothing or node.op_type in RESHAPING:
-        return [Node.new("Identity", [source], node.outputs[0], node.name)]
+        return [node.replaced_by("Identity", [source])]
     return None
 
 
 def _with_pads(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
     """Return a strided window with its pads in place of auto_pad SAME; None if it states them."""
     weight = graph.value(node, 1)
-    _, _, rows, columns = sizes[node.inputs[0]]
+    _, _, rows, columns = sizes[node.source]
     match = node.window(() if weight is None else weight.shape[2:], (rows, columns))
     if match is None or not _leaves_pads(node):
         return None
     attributes = {**node.attributes, "auto_pad": "NOTSET", "pads": list(match[1].pads)}
-    return [Node.new(node.op_type, node.inputs, node.outputs[0], node.name, **attributes)]
+    return [node.replaced_by(node.op_type, node.inputs, **attributes)]
 
 
 def _leaves_pads(node: Node) -> bool:
@@ -187,8 +187,8 @@ def _by_factors(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None
     """Return a Resize by factors in place of one to a size; None if no whole number divides one of
     the sizes into the other, so that factors may be rounded, and the result have another size.
     """
-    before = sizes[node.inputs[0]]
-    factors = np.divide(sizes[node.outputs[0]], before)
+    before = sizes[node.source]
+    factors = np.divide(sizes[node.result], before)
     if len(node.inputs) < 4 or any(factor % 1 and (1 / factor) % 1 for factor in factors):
         return None
     scales = graph.add_constant(f"{node.name}.scales", factors)
@@ -196,20 +196,20 @@ def _by_factors(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None
     # One pixel is the same in all modes.
     if before[2:] == (1, 1):
         attributes = OF_BLOCKS
-    inputs = [node.inputs[0], "", scales]
-    return [Node.new("Resize", inputs, node.outputs[0], node.name, **attributes)]
+    inputs = [node.source, "", scales]
+    return [node.replaced_by("Resize", inputs, **attributes)]
 
 
 def _expanded(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
     """Return nothing but another name for an Expand without effect, or the convolution that repeats
     a map of one channel; None for other Expands.
     """
-    source = node.inputs[0]
-    result = node.outputs[0]
+    source = node.source
+    result = node.result
     before = sizes[source]
     after = sizes[result]
     if before == after or _is_broadcast_anyway(graph, node, sizes):
-        return [Node.new("Identity", [source], result, node.name)]
+        return [node.replaced_by("Identity", [source])]
     if before[1] > 1 or before[2:] != after[2:]:
         return None
     return [graph.convolution(source, result, node.name, np.ones((after[1], 1, 1, 1)))]
@@ -217,7 +217,7 @@ def _expanded(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
 
 def _is_broadcast_anyway(graph: OnnxGraph, node: Node, sizes: Sizes) -> bool:
     """Return True if all readers of an Expand are arithmetic that broadcasts to the same size."""
-    result = node.outputs[0]
+    result = node.result
     # What another Expand enlarges may be small itself, so it does not count.
     large = {
         name
@@ -242,9 +242,9 @@ def _with_written_maps(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node]
     Returns:
         The convolutions and the Concat, None if a constant is no map of one number a channel.
     """
-    source = node.inputs[0]
+    source = node.source
     before = sizes[source]
-    after = sizes[node.outputs[0]]
+    after = sizes[node.result]
     maps = {name: graph.constants[name] for name in node.inputs if name in graph.constants}
     is_map = all(
         value.ndim == 4 and value.shape[2:] == after[2:] and (value == value[..., :1, :1]).all()
@@ -255,7 +255,7 @@ def _with_written_maps(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node]
     nodes: list[Node] = []
     names = {}
     for number, (name, value) in enumerate(maps.items()):
-        names[name] = f"{node.outputs[0]}.constant_{number}"
+        names[name] = f"{node.result}.constant_{number}"
         # With weights of zero the result is the bias alone, in the size of the map that is read.
         weight = np.zeros((value.shape[1], before[1], 1, 1))
         bias = value[0, :, 0, 0]

@@ -39,10 +39,10 @@ class ConnectByConvolutions:
         """Return the nodes that replace a node, an empty list if it is not needed, and None if it
         stays.
         """
-        name = node.inputs[0] if node.inputs else ""
+        name = node.source
         if self._flattens(graph, node):
             channels, height, width = self._shapes[name][1:]
-            self._maps[node.outputs[0]] = name, (channels, height, width)
+            self._maps[node.result] = name, (channels, height, width)
         if name not in self._maps or len(node.outputs) != 1:
             return None
         source, size = self._maps[name]
@@ -50,7 +50,7 @@ class ConnectByConvolutions:
             return self._connected(graph, node, source, size)
         is_over_channels = size[1:] == (1, 1) and node.attributes.get("axis", -1) in (1, -1)
         if node.op_type == "Softmax" and is_over_channels:
-            softmax = Node.new("Softmax", [source], node.outputs[0], node.proto.name, axis=1)
+            softmax = Node.new("Softmax", [source], node.result, node.proto.name, axis=1)
             return self._flat(softmax, size)
         if node.op_type in POINTWISE:
             image = Node.of(node.written())
@@ -61,13 +61,13 @@ class ConnectByConvolutions:
         )
         maps = [1, *size], [0, *size], [-1, *size]
         if is_private and node.op_type == "Reshape" and graph.numbers(node, 1, "") in maps:
-            graph.rename(source, node.outputs[0])
+            graph.rename(source, node.result)
             return []
         return None
 
     def _flattens(self, graph: OnnxGraph, node: Node) -> bool:
         """Return True if a node makes (N, C H W) of a map whose size is known (1)."""
-        sizes = self._shapes.get(node.inputs[0], ()) if node.inputs else ()
+        sizes = self._shapes.get(node.source, ()) if node.inputs else ()
         if len(sizes) != 4 or min(sizes[1:]) < 1:
             return False
         if node.op_type == "Flatten":
@@ -98,14 +98,14 @@ class ConnectByConvolutions:
         weight = weight * np.float32(attribute("alpha", 1.0))
         offset = np.broadcast_to(bias.reshape(-1) * attribute("beta", 1.0), len(weight))
         kernel = weight.reshape(-1, *size)
-        conv = graph.convolution(source, node.outputs[0], node.name, kernel, offset)
+        conv = graph.convolution(source, node.result, node.name, kernel, offset)
         return self._flat(conv, (len(weight), 1, 1))
 
     def _flat(self, image: Node, size: Map) -> list[Node]:
         """Return a node that makes a map, and the map flat under the name of its result."""
         (name,) = image.outputs
         image.outputs = (f"{name}.map",)
-        self._maps[name] = image.outputs[0], size
+        self._maps[name] = image.result, size
         return [image, Node.new("Flatten", image.outputs, name, f"{name}.flat")]
 
 

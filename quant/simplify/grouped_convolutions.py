@@ -52,5 +52,5 @@ def without_groups(graph: OnnxGraph, node: Node) -> list[Node] | None:
     }
     if node.op_type == "Conv":
         del attributes["output_padding"]
-    inputs = [node.inputs[0], name, *node.inputs[2:]]
-    return [Node.new(node.op_type, inputs, node.outputs[0], node.proto.name, **attributes)]
+    inputs = [node.source, name, *node.inputs[2:]]
+    return [Node.new(node.op_type, inputs, node.result, node.proto.name, **attributes)]

@@ -35,17 +35,17 @@ def clip_last(graph: OnnxGraph, node: Node) -> list[Node] | None:
         A product, a sum if there is a shift, and the Clip; None if the node does not end a network
         in this way.
     """
-    if node.outputs[0] not in graph.outputs:
+    if node.result not in graph.outputs:
         return None
-    source, affine = affine_chain(graph, node.outputs[0])
+    source, affine = affine_chain(graph, node.result)
     clip = graph.sole_writer(source)
-    if source == node.outputs[0] or clip is None or clip.op_type != "Clip":
+    if source == node.result or clip is None or clip.op_type != "Clip":
         return None
     limits = [graph.value(clip, place) for place in (1, 2)]
     has_limits = all(limit is not None and limit.size == 1 for limit in limits)
     if not has_limits or affine.channels > 1 or not affine.scale.all():
         return None
-    name = node.outputs[0]
+    name = node.result
     scale = graph.add_constant(f"{name}.scale", affine.scale)
     # A negative scale exchanges the two limits.
     low, high = sorted((affine.scale * limit + affine.shift).item() for limit in limits)
@@ -54,11 +54,11 @@ def clip_last(graph: OnnxGraph, node: Node) -> list[Node] | None:
         graph.add_constant(f"{name}.high", np.array(high)),
     ]
     last = f"{name}.scaled"
-    nodes = [Node.new("Mul", [clip.inputs[0], scale], last, last)]
+    nodes = [Node.new("Mul", [clip.source, scale], last)]
     if affine.shift.any():
         shift = graph.add_constant(f"{name}.shift", affine.shift)
         last = f"{name}.shifted"
-        nodes.append(Node.new("Add", [nodes[0].outputs[0], shift], last, last))
+        nodes.append(Node.new("Add", [nodes[0].result, shift], last))
     return [*nodes, Node.new("Clip", [last, *ends], name, clip.name)]
 
 
@@ -73,19 +73,19 @@ def add_to_image(graph: OnnxGraph, node: Node) -> list[Node] | None:
     Returns:
         A product and the sum; None if the node does not undo the normalisation of the image.
     """
-    source, behind = affine_chain(graph, node.outputs[0])
+    source, behind = affine_chain(graph, node.result)
     total = graph.writers.get(source)
-    if source == node.outputs[0] or total is None or total.op_type != "Add":
+    if source == node.result or total is None or total.op_type != "Add":
         return None
     for place, name in enumerate(total.inputs):
         image, before = affine_chain(graph, name, is_sole=False)
         if image in graph.inputs and name != image and _undoes(behind, before, graph.inputs[image]):
-            result = node.outputs[0]
+            result = node.result
             factor = graph.add_constant(f"{result}.scale", behind.scale.reshape(1, -1, 1, 1))
             correction = f"{result}.correction"
             return [
-                Node.new("Mul", [total.inputs[1 - place], factor], correction, correction),
-                Node.new("Add", [image, correction], result, node.name),
+                Node.new("Mul", [total.inputs[1 - place], factor], correction),
+                node.replaced_by("Add", [image, correction]),
             ]
     return None
 

@@ -52,7 +52,7 @@ def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
     # A part may have MOST_POSITIONS // columns rows, so this is the least number of parts.
     step = -(-rows // (MOST_POSITIONS // columns))
     dilations = node.attributes.get("dilations", [1, 1])
-    name = node.proto.name or node.outputs[0]
+    name = node.proto.name or node.result
     nodes: list[Node] = []
     parts: list[str] = []
     # 1.
@@ -63,12 +63,12 @@ def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
         above = pads[0] - first * dilations[0]
         below = pads[2] - behind * dilations[0]
         part = f"{name}.rows_{first}"
-        source = node.inputs[0]
+        source = node.source
         if min(above, below) < 0:
             tap = np.eye(max(-above, 0) + max(-below, 0) + 1)[max(-above, 0)]
             crop = np.tile(tap[:, None], (channels, 1, 1, 1))
             source = f"{part}.cropped"
-            nodes.append(graph.convolution(node.inputs[0], source, source, crop, group=channels))
+            nodes.append(graph.convolution(node.source, source, source, crop, group=channels))
         attributes = {
             **node.attributes,
             "kernel_shape": list(kernel.shape[2:]),
@@ -79,7 +79,7 @@ def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
         parts.append(part)
     # 2.
     # The bias is added once, by the convolution that sums, so the parts have none.
-    joined = Node.new("Concat", parts, f"{name}.rows", f"{name}.rows", axis=1)
+    joined = Node.new("Concat", parts, f"{name}.rows", axis=1)
     ones = graph.add_constant(f"{name}.sum", np.tile(np.eye(outputs), step)[..., None, None])
-    feeds = [joined.outputs[0], ones, *node.inputs[2:]]
-    return [*nodes, joined, Node.new("Conv", feeds, node.outputs[0], name, kernel_shape=[1, 1])]
+    feeds = [joined.result, ones, *node.inputs[2:]]
+    return [*nodes, joined, Node.new("Conv", feeds, node.result, name, kernel_shape=[1, 1])]

@@ -57,7 +57,7 @@ def with_missing_border(model: onnx.ModelProto) -> onnx.ModelProto:
         node.inputs = tuple(mirrored if name == image else name for name in node.inputs)
     amounts = np.array([0, 0, border_px, border_px] * 2)
     pads = graph.add_constant(f"{mirrored}.pads", amounts, np.int64)
-    pad = Node.new("Pad", [image, pads], mirrored, mirrored, mode="reflect")
+    pad = Node.new("Pad", [image, pads], mirrored, mode="reflect")
     graph.set_nodes([pad, *graph.nodes])
     graph.save()
     return network

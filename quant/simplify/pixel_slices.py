@@ -29,9 +29,9 @@ def convolve_slice(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] |
     Returns:
         The convolution. None for any other Slice, and for any other node.
     """
-    size = shapes.get(node.inputs[0], ()) if node.op_type == "Slice" else ()
+    size = shapes.get(node.source, ()) if node.op_type == "Slice" else ()
     cuts = slices_of(graph, node) if len(size) == 4 and size[1] else {}
-    is_end = node.outputs[0] in graph.outputs and cuts.get(2) == cuts.get(3)
+    is_end = node.result in graph.outputs and cuts.get(2) == cuts.get(3)
     # The host crops the result of a network, also where it mirrored the image before.
     if not cuts or not cuts.keys() <= {2, 3} or is_end:
         return None
@@ -54,8 +54,8 @@ def convolve_slice(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] |
             return None
     weight = np.tile(np.outer(taps[0], taps[1]), (size[1], 1, 1, 1))
     conv = graph.convolution(
-        node.inputs[0],
-        node.outputs[0],
+        node.source,
+        node.result,
         node.name,
         weight,
         dilations=dilations,

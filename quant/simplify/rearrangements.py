@@ -63,14 +63,14 @@ def rearranged(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
     """
     source, chain = _chain(graph, node)
     before = sizes.get(source, ())
-    result = node.outputs[0]
+    result = node.result
     after = sizes.get(result, ())
     if len(before) != 4 or len(after) != 4 or not 0 < math.prod(before) <= MOST_VALUES:
         return None
     image = np.arange(math.prod(before)).reshape(before)
     moved = image
     for each in chain:
-        moved = _moved(graph, moved, each, sizes[each.outputs[0]])
+        moved = _moved(graph, moved, each, sizes[each.result])
     if after[2] > before[2]:
         return _enlarged(graph, node, source, image, moved)
     block = before[2] // after[2]
@@ -84,7 +84,7 @@ def rearranged(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
     if not np.array_equal(blocks[:, order], moved):
         return None
     if block > 1 and np.array_equal(order, np.arange(block * block)):
-        return [Node.new("SpaceToDepth", [source], result, node.name, blocksize=block)]
+        return [node.replaced_by("SpaceToDepth", [source], blocksize=block)]
     if block > 1 and source in graph.inputs:
         return None
     weight = np.eye(blocks.shape[1])[order].reshape(-1, channels, block, block)
@@ -98,19 +98,18 @@ def _enlarged(
     factor = moved.shape[2] // image.shape[2]
     if not np.array_equal(moved, image.repeat(factor, 2).repeat(factor, 3)):
         return None
-    result = node.outputs[0]
-    scales = graph.add_constant(f"{result}.scales", np.array([1, 1, factor, factor]))
-    return [Node.new("Resize", [source, "", scales], result, node.name, **OF_BLOCKS)]
+    scales = graph.add_constant(f"{node.result}.scales", np.array([1, 1, factor, factor]))
+    return [node.replaced_by("Resize", [source, "", scales], **OF_BLOCKS)]
 
 
 def _chain(graph: OnnxGraph, node: Node) -> tuple[str, list[Node]]:
     """Return the tensor that a chain up to this node begins with, and its nodes in order."""
     chain = [node]
-    writer = graph.sole_writer(node.inputs[0])
+    writer = graph.sole_writer(node.source)
     while writer is not None and writer.op_type in MOVING:
         chain.insert(0, writer)
-        writer = graph.sole_writer(writer.inputs[0])
-    return chain[0].inputs[0], chain
+        writer = graph.sole_writer(writer.source)
+    return chain[0].source, chain
 
 
 def _moved(graph: OnnxGraph, values: np.ndarray, node: Node, size: tuple[int, ...]) -> np.ndarray:

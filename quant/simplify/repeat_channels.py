@@ -28,8 +28,8 @@ def repeat_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] 
     Returns:
         The convolution, and the arithmetic; None if the node repeats no channels.
     """
-    source = node.inputs[0]
-    result = node.outputs[0]
+    source = node.source
+    result = node.result
     channels = channels_in(shapes, source)
     if node.op_type == "Tile":
         repeats = graph.value(node, 1)
@@ -65,7 +65,7 @@ def join_copies(graph: OnnxGraph, node: Node) -> list[Node] | None:
         conv = graph.writers.get(name)
         if name == image:
             weights.append(np.eye(graph.inputs[image][1])[:, :, None, None])
-        elif conv is not None and conv.op_type == "Conv" and conv.inputs[0] == image:
+        elif conv is not None and conv.op_type == "Conv" and conv.source == image:
             weights.append(graph.constants[conv.inputs[1]])
         else:
             return None
@@ -74,7 +74,7 @@ def join_copies(graph: OnnxGraph, node: Node) -> list[Node] | None:
         )
         if weights[-1].shape[2:] != (1, 1) or not is_plain:
             return None
-    return [graph.convolution(image, node.outputs[0], node.name, np.concatenate(weights))]
+    return [graph.convolution(image, node.result, node.name, np.concatenate(weights))]
 
 
 def broadcasts_channels(model: onnx.ModelProto) -> bool:
@@ -95,7 +95,7 @@ def _narrow_input(shapes: Shapes, graph: OnnxGraph, node: Node) -> str | None:
         return None
     widths = [channels_in(shapes, name) for name in node.inputs]
     narrow = node.inputs[int(widths[0] > widths[1])]
-    result = node.outputs[0]
+    result = node.result
     readers = {reader.op_type for reader in graph.readers[result]}
     is_end = node.op_type == "Add" and (result in graph.outputs or readers <= HOST)
     is_repeated = min(widths) == 1 < max(widths) and not (is_end and narrow in graph.inputs)

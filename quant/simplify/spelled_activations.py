@@ -44,11 +44,11 @@ def join_clips(graph: OnnxGraph, node: Node) -> list[Node] | None:
         low, high = (float(np.clip(limit, low, high)) for limit in limits)
         writer = graph.sole_writer(source)
         count += 1
-    result = node.outputs[0]
+    result = node.result
     if count == 1 and (node.op_type == "Relu" or (low, high) == (0, 6)):
         return None
     if low == 0 and high == np.inf:
-        return [Node.new("Relu", [source], result, node.name)]
+        return [node.replaced_by("Relu", [source])]
     readers = {reader.op_type for reader in graph.readers[result]}
     is_last = result in graph.outputs or "DepthToSpace" in readers
     # A bank of filters for a sensor is mirrored, and is quantised from its weights.
@@ -62,21 +62,21 @@ def join_clips(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
     ends = [constant("zero", 0), constant("six", 6)]
     if (low, high) == (0, 6):
-        return [Node.new("Clip", [source, *ends], result, node.name)]
+        return [node.replaced_by("Clip", [source, *ends])]
     names = [f"{result}.{role}" for role in ("shifted", "divided", "clipped", "times")]
     shifted, divided, clipped, times = names
     return [
-        Node.new("Sub", [source, constant("low", low)], shifted, shifted),
-        Node.new("Div", [shifted, constant("unit", unit)], divided, divided),
+        Node.new("Sub", [source, constant("low", low)], shifted),
+        Node.new("Div", [shifted, constant("unit", unit)], divided),
         Node.new("Clip", [divided, *ends], clipped, node.name),
-        Node.new("Mul", [clipped, constant("unit", unit)], times, times),
+        Node.new("Mul", [clipped, constant("unit", unit)], times),
         Node.new("Add", [times, constant("low", low)], result, f"{result}.raised"),
     ]
 
 
 def _limits(graph: OnnxGraph, node: Node) -> tuple[str, float, float] | None:
     """Return the tensor that a node clips, and the low and the high limit; None for another."""
-    source = node.inputs[0] if node.inputs else ""
+    source = node.source
     if node.op_type == "Relu":
         return source, 0.0, np.inf
     if node.op_type == "Clip":
@@ -108,16 +108,15 @@ def join_hard_swish(graph: OnnxGraph, node: Node) -> list[Node] | None:
     Returns:
         The activation; None if the node completes none.
     """
-    result = node.outputs[0]
     clipped = _sixth_of(graph, node) or ""
     shifted = _shifted_and_clipped(graph, clipped)
     if shifted is not None:
-        return [Node.new("HardSigmoid", [shifted], result, node.name, **SLOPE_AND_OFFSET)]
+        return [node.replaced_by("HardSigmoid", [shifted], **SLOPE_AND_OFFSET)]
     source = _gated_by(graph, node, _hard_sigmoid_of)
     product = graph.sole_writer(clipped)
     if product is not None:
         source = _gated_by(graph, product, _shifted_and_clipped)
-    return None if source is None else [Node.new("HardSwish", [source], result, node.name)]
+    return None if source is None else [node.replaced_by("HardSwish", [source])]
 
 
 def join_sigmoid(graph: OnnxGraph, node: Node) -> list[Node] | None:
@@ -130,7 +129,7 @@ def join_sigmoid(graph: OnnxGraph, node: Node) -> list[Node] | None:
     Returns:
         A product and the Sigmoid; None if the node is something else.
     """
-    result = node.outputs[0]
+    result = node.result
     source, affine = affine_chain(graph, result)
     tanh = graph.sole_writer(source)
     is_half = (affine.scale == 0.5).all() and (affine.shift == 0.5).all()
@@ -139,8 +138,8 @@ def join_sigmoid(graph: OnnxGraph, node: Node) -> list[Node] | None:
     doubled = f"{result}.doubled"
     two = graph.add_constant(f"{result}.two", np.array(2.0))
     return [
-        Node.new("Mul", [tanh.inputs[0], two], doubled, doubled),
-        Node.new("Sigmoid", [doubled], result, node.name),
+        Node.new("Mul", [tanh.source, two], doubled),
+        node.replaced_by("Sigmoid", [doubled]),
     ]
 
 
@@ -161,11 +160,10 @@ def halve_before_gelu(graph: OnnxGraph, node: Node) -> list[Node] | None:
     for source, gate in (product.inputs, product.inputs[::-1]):
         if gelu_gate_input(graph, gate) == source:
             (half,) = (name for name in node.inputs if name in graph.constants)
-            halved = f"{product.outputs[0]}.half"
-            result = node.outputs[0]
+            halved = f"{product.result}.half"
             return [
-                Node.new("Mul", [source, half], halved, halved),
-                Node.new("Mul", [halved, gate], result, node.name),
+                Node.new("Mul", [source, half], halved),
+                node.replaced_by("Mul", [halved, gate]),
             ]
     return None
 
@@ -181,7 +179,7 @@ def gelu_gate_input(graph: OnnxGraph, name: str) -> str | None:
     erf = graph.writers.get(other_operand(graph, graph.writers.get(name), "Add", 1) or "")
     if erf is None or erf.op_type != "Erf":
         return None
-    scaled = graph.writers.get(erf.inputs[0])
+    scaled = graph.writers.get(erf.source)
     # Exporters divide by sqrt(2), or multiply by its reciprocal.
     by_factor = other_operand(graph, scaled, "Mul", sqrt(0.5))
     return by_factor or other_operand(graph, scaled, "Div", sqrt(2))
@@ -204,13 +202,13 @@ def _hard_sigmoid_of(graph: OnnxGraph, name: str) -> str | None:
         return None
     slope_and_offset = node.attributes.get("alpha", 0.2), node.attributes.get("beta", 0.5)
     is_of_hard_swish = np.allclose(slope_and_offset, (1 / 6, 0.5), atol=1e-6)
-    return node.inputs[0] if is_of_hard_swish else None
+    return node.source if is_of_hard_swish else None
 
 
 def _sixth_of(graph: OnnxGraph, node: Node) -> str | None:
     """Return the tensor of which a node computes a sixth."""
     if node.op_type == "Div" and _scalar(graph, node, 1) == 6:
-        return node.inputs[0]
+        return node.source
     return other_operand(graph, node, "Mul", 1 / 6)
 
 
@@ -219,7 +217,7 @@ def _shifted_and_clipped(graph: OnnxGraph, name: str) -> str | None:
     clip = graph.writers.get(name)
     if clip is None or clip.op_type != "Clip":
         return None
-    shift = graph.writers.get(clip.inputs[0])
+    shift = graph.writers.get(clip.source)
     if (_scalar(graph, clip, 1), _scalar(graph, clip, 2)) != (0, 6) or shift is None:
         return None
     return other_operand(graph, shift, "Add", 3)

@@ -37,7 +37,7 @@ def split_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] |
         The operations that replace the node; None if it does not split channels.
     """
     parts = _parts(graph, node, shapes)
-    source = node.inputs[0] if parts else ""
+    source = node.source if parts else ""
     only_parts = all(_parts(graph, reader, shapes) for reader in graph.readers[source])
     divides = source not in graph.outputs and only_parts
     nodes: list[Node] = []
@@ -54,7 +54,7 @@ def _parts(graph: OnnxGraph, node: Node, shapes: Shapes) -> list[Part]:
         node: any node.
         shapes: the shapes of each float tensor.
     """
-    numbers = np.arange(channels_in(shapes, node.inputs[0]) if node.inputs else 0)
+    numbers = np.arange(channels_in(shapes, node.source) if node.inputs else 0)
     if not len(numbers):
         return []
     if node.op_type == "Split" and node.attributes.get("axis", 0) in CHANNEL_AXIS:
@@ -64,9 +64,9 @@ def _parts(graph: OnnxGraph, node: Node, shapes: Shapes) -> list[Part]:
         return list(zip(node.outputs, np.split(numbers, np.cumsum(widths[:-1])), strict=True))
     chosen = graph.value(node, 1) if node.op_type == "Gather" else None
     if chosen is not None and chosen.ndim == 1 and node.attributes.get("axis", 0) in CHANNEL_AXIS:
-        return [(node.outputs[0], numbers[chosen])]
+        return [(node.result, numbers[chosen])]
     cuts = slices_of(graph, node) if node.op_type == "Slice" else {}
-    return [(node.outputs[0], numbers[cuts[1]])] if cuts.keys() == {1} else []
+    return [(node.result, numbers[cuts[1]])] if cuts.keys() == {1} else []
 
 
 def _compute(
@@ -90,8 +90,8 @@ def _compute(
     if before is not None and (is_pointwise or groups > 1):
         # An activation works on each value by itself, and a depthwise kernel on each channel, so
         # that the map in front has parts too.
-        reads_once = graph.n_reads(before.inputs[0]) == 1
-        in_front = _compute(graph, before.inputs[0], shapes, channels, inner, reads_once)
+        reads_once = graph.n_reads(before.source) == 1
+        in_front = _compute(graph, before.source, shapes, channels, inner, reads_once)
     if before is not None and is_pointwise:
         behind = Node.of(before.written())
         behind.proto.name = f"{name}.{before.op_type}"
@@ -103,7 +103,7 @@ def _compute(
         bias = graph.value(before, 2)
         bias = bias if bias is None else bias[channels]
         attributes = {**before.attributes, "group": len(channels) if groups > 1 else 1}
-        front = inner if in_front else before.inputs[0]
+        front = inner if in_front else before.source
         conv = graph.convolution(front, name, f"{name}.Conv", weight, bias, **attributes)
         return [*in_front, conv]
     weight = np.eye(shapes[source][1])[channels][..., None, None]
@@ -134,7 +134,7 @@ def read_unselected(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] 
     Returns:
         The concat and the convolution; None if the node is something else.
     """
-    joined = graph.sole_writer(node.inputs[0]) if _groups(graph, node) == 1 else None
+    joined = graph.sole_writer(node.source) if _groups(graph, node) == 1 else None
     if joined is None or joined.op_type != "Concat":
         return None
     weight = graph.constants[node.inputs[1]]
@@ -151,12 +151,12 @@ def read_unselected(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] 
             parts.append(name)
             columns.append(part)
         else:
-            parts.append(before.inputs[0])
+            parts.append(before.source)
             columns.append(np.einsum("oirc,ij->ojrc", part, chosen))
     if parts == list(joined.inputs) or first != weight.shape[1]:
         return None
     name = f"{node.name}.whole"
-    concat = Node.new("Concat", parts, name, name, axis=1)
+    concat = Node.new("Concat", parts, name, axis=1)
     wide = graph.add_constant(f"{name}.weight", np.concatenate(columns, 1))
     behind = Node.of(node.written())
     behind.inputs = (name, wide, *node.inputs[2:])

@@ -73,7 +73,7 @@ def split_sums(_: OnnxGraph, node: Node) -> list[Node] | None:
     """
     if node.op_type != "Sum" or len(node.inputs) < 2:
         return None
-    subtotal = node.inputs[0]
+    subtotal = node.source
     (output,) = node.outputs
     adds = []
     for number, name in enumerate(node.inputs[1:], 1):
@@ -101,23 +101,23 @@ def choose_by_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
     (result,) = node.outputs
     rest = f"{result}.difference"
     limited = f"{result}.relu"
-    relu = Node.new("Relu", [rest], limited, limited)
+    relu = Node.new("Relu", [rest], limited)
     a, *others = node.inputs
     if node.op_type == "Abs":
         positive = f"{result}.positive"
         return [
-            Node.new("Neg", [a], rest, rest),
+            Node.new("Neg", [a], rest),
             relu,
-            Node.new("Relu", [a], positive, positive),
-            Node.new("Add", [positive, limited], result, node.name),
+            Node.new("Relu", [a], positive),
+            node.replaced_by("Add", [positive, limited]),
         ]
     if len(others) != 1 or not graph.constants.keys().isdisjoint(node.inputs):
         return None
     is_max = node.op_type == "Max"
     return [
-        Node.new("Sub", [*others, a] if is_max else [a, *others], rest, rest),
+        Node.new("Sub", [*others, a] if is_max else [a, *others], rest),
         relu,
-        Node.new("Add" if is_max else "Sub", [a, limited], result, node.name),
+        node.replaced_by("Add" if is_max else "Sub", [a, limited]),
     ]
 
 
@@ -134,7 +134,7 @@ def multiply_squares(graph: OnnxGraph, node: Node) -> list[Node] | None:
     exponent = graph.value(node, 1) if node.op_type == "Pow" else None
     if exponent is None or exponent.size != 1 or exponent.item() != 2:
         return None
-    return [Node.new("Mul", [node.inputs[0]] * 2, node.outputs[0], node.name)]
+    return [node.replaced_by("Mul", [node.source] * 2)]
 
 
 def drop_where(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
@@ -152,7 +152,7 @@ def drop_where(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | Non
     if chooses is None or chooses.size != 1:
         return None
     source = node.inputs[1] if chooses.item() else node.inputs[2]
-    result = node.outputs[0]
+    result = node.result
     # A smaller map would have been repeated.
     is_of_size = source in shapes and shapes[source] == shapes.get(result)
     if graph.sole_writer(source) is None or not is_of_size:
@@ -174,11 +174,11 @@ def drop_cast(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None
     Returns:
         An empty list if the node is removed; None if it stays.
     """
-    if node.op_type != "Cast" or node.inputs[0] not in shapes:
+    if node.op_type != "Cast" or node.source not in shapes:
         return None
-    if graph.sole_writer(node.inputs[0]) is None or node.attributes["to"] != TensorProto.FLOAT:
+    if graph.sole_writer(node.source) is None or node.attributes["to"] != TensorProto.FLOAT:
         return None
-    graph.rename(node.inputs[0], node.outputs[0])
+    graph.rename(node.source, node.result)
     return []
 
 
@@ -195,7 +195,7 @@ def pool_mean(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None
     Returns:
         The nodes that replace the mean; None if the node is something else.
     """
-    size = shapes.get(node.inputs[0], ()) if node.op_type in ("ReduceMean", "ReduceSum") else ()
+    size = shapes.get(node.source, ()) if node.op_type in ("ReduceMean", "ReduceSum") else ()
     # From opset 18 on the axes are an input.
     axes = {axis % 4 for axis in graph.numbers(node, 1, "axes") or ()} if size else set()
     (output, *_) = node.outputs
@@ -206,7 +206,7 @@ def pool_mean(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None
         weight = np.ones((1, size[1], 1, 1))
         if node.op_type == "ReduceMean":
             weight /= size[1]
-        return [graph.convolution(node.inputs[0], output, node.name, weight)]
+        return [graph.convolution(node.source, output, node.name, weight)]
     if len(size) != 4 or axes != {2, 3} or node.op_type != "ReduceMean":
         return None
     if node.attributes.get("keepdims", 1):
@@ -280,7 +280,7 @@ def shrink_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[
         The convolution; None if the node is something else, or reads pixels beyond its block.
     """
     factors = graph.numbers(node, 2, "scales") if node.op_type == "Resize" else None
-    channels = channels_in(shapes, node.inputs[0]) if factors else 0
+    channels = channels_in(shapes, node.source) if factors else 0
     attribute = node.attributes.get
     where = attribute("coordinate_transformation_mode", "half_pixel")
     mode = attribute("mode", "nearest")
@@ -298,9 +298,7 @@ def shrink_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[
     taps = np.maximum(1 - abs(np.arange(block) - place), 0)
     weight = np.broadcast_to(np.outer(taps, taps), (channels, 1, block, block))
     strides = [block, block]
-    result = node.outputs[0]
+    result = node.result
     return [
-        graph.convolution(
-            node.inputs[0], result, node.name, weight, strides=strides, group=channels
-        )
+        graph.convolution(node.source, result, node.name, weight, strides=strides, group=channels)
     ]

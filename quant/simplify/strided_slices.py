@@ -34,14 +34,14 @@ def unshuffle_slices(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node]
     origins = {_origin(graph, name)[0] for name in node.inputs}
     source, *others = origins
     size = shapes.get(source, ())
-    readers = graph.readers[node.outputs[0]]
+    readers = graph.readers[node.result]
     takes_order = all(
         reader.op_type == "Conv"
         and is_convolution(graph, reader)
         and reader.attributes.get("group", 1) == 1
         for reader in readers
     )
-    is_read = readers and node.outputs[0] not in graph.outputs
+    is_read = readers and node.result not in graph.outputs
     if others or len(size) != 4 or size[1] < 1 or not is_read or not takes_order:
         return None
     for block in BLOCKS:
@@ -53,9 +53,8 @@ def unshuffle_slices(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node]
             weight = graph.constants[reader.inputs[1]]
             # Channel k of the Concat is channel order[k] of the unshuffle.
             name = graph.add_constant(f"{reader.name}.weight", weight[:, np.argsort(order)])
-            reader.inputs = (reader.inputs[0], name, *reader.inputs[2:])
-        output = node.outputs[0]
-        return [Node.new("SpaceToDepth", [source], output, node.name, blocksize=block)]
+            reader.inputs = (reader.source, name, *reader.inputs[2:])
+        return [node.replaced_by("SpaceToDepth", [source], blocksize=block)]
     return None
 
 
@@ -64,7 +63,7 @@ def _origin(graph: OnnxGraph, name: str) -> tuple[str, list[Node]]:
     slices: list[Node] = []
     while (writer := graph.writers.get(name)) is not None and writer.op_type == "Slice":
         slices.insert(0, writer)
-        name = writer.inputs[0]
+        name = writer.source
     return name, slices
 
 

@@ -211,12 +211,12 @@ class _Walk:
         else:
             # A board's file dequantises its weights by such nodes.
             at.require(node.op_type in KEEPING, "reads constants only (fold them)")
-            self._shapes[node.outputs[0]] = self._shapes[node.inputs[0]]
+            self._shapes[node.result] = self._shapes[node.source]
 
     def _step(self, at: AxisNode, grids: list[_Grid]) -> AxisMap:
         if at.node.op_type in AXIS_MAPS:
             at.require(
-                at.node.inputs[0] in self._grids and len(grids) == 1,
+                at.node.source in self._grids and len(grids) == 1,
                 "has parameters that the image determines",
             )
             at.require(
