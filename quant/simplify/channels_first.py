@@ -54,11 +54,11 @@ def channels_first(model: onnx.ModelProto) -> None:
         return
     results = [node.result for node in ends]
 
-    def without(_: OnnxGraph, node: Node) -> list[Node] | None:
-        is_end = node.result in results
-        return [node.replaced_by("Identity", node.inputs)] if is_end else None
-
-    graph.rewrite(without)
+    graph.rewrite(
+        lambda _, node: (
+            [node.replaced_by("Identity", node.inputs)] if node.result in results else None
+        )
+    )
     graph.save()
     for value in (*network.graph.input, *network.graph.output):
         dims = value.type.tensor_type.shape.dim

@@ -173,7 +173,13 @@ def affine_of(graph: OnnxGraph, node: Node) -> tuple[str, Affine] | None:
         else.
     """
     if node.op_type == NORMALISATION:
-        return _normalisation(graph, node)
+        values = [_float64(graph, node, place) for place in range(1, 5)]
+        is_trained = node.attributes.get("training_mode", 0) or len(node.outputs) > 1
+        if is_trained or any(value is None for value in values):
+            return None
+        gain, offset, mean, variance = values
+        scale = gain / np.sqrt(variance + node.attributes.get("epsilon", 1e-5))
+        return node.source, Affine(scale, offset - mean * scale)
     if node.op_type == "Neg":
         return node.source, Affine(-np.ones(1), np.zeros(1))
     if node.op_type not in ("Add", "Div", "Mul", "Sub"):
@@ -221,16 +227,6 @@ def _arithmetic(kind: str, value: np.ndarray, place: int) -> Affine | None:
     return Affine(1 / value, zero) if place == 0 and value.all() else None
 
 
-def _normalisation(graph: OnnxGraph, node: Node) -> tuple[str, Affine] | None:
-    values = [_float64(graph, node, place) for place in range(1, 5)]
-    is_trained = node.attributes.get("training_mode", 0) or len(node.outputs) > 1
-    if is_trained or any(value is None for value in values):
-        return None
-    gain, offset, mean, variance = values
-    scale = gain / np.sqrt(variance + node.attributes.get("epsilon", 1e-5))
-    return node.source, Affine(scale, offset - mean * scale)
-
-
 def per_channel(value: np.ndarray | None) -> np.ndarray | None:
     """Return a constant as one number per channel, if it has that effect on a map (N, C, H, W).
 
@@ -271,26 +267,13 @@ def _width(graph: OnnxGraph, node: Node) -> int:
     return int(shape[0] if node.op_type == "Conv" else shape[1] * groups)
 
 
-def _weights(graph: OnnxGraph, node: Node) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights and bias (O,) of a convolution, in float64."""
-    weight = graph.constants[node.inputs[1]].astype(np.float64)
-    bias = _float64(graph, node, 2)
-    return weight, np.zeros(_width(graph, node)) if bias is None else bias
-
-
-def _set_weights(graph: OnnxGraph, node: Node, weight: np.ndarray, bias: np.ndarray) -> None:
-    """Give a convolution weights and a bias of its own: the old ones may serve others too."""
-    name = node.proto.name or node.result
-    numbers = {"weight": weight, "bias": bias}
-    names = [graph.add_constant(f"{name}.{role}", value) for role, value in numbers.items()]
-    node.inputs = (node.source, *names)
-
-
 def _fold(graph: OnnxGraph, node: Node, affine: Affine, into_results: bool) -> None:
     """Fold scale and shift of a convolution's results, or of its input map, into the
     convolution.
     """
-    weight, bias = _weights(graph, node)
+    weight = graph.constants[node.inputs[1]].astype(np.float64)
+    stated_bias = _float64(graph, node, 2)
+    bias = np.zeros(_width(graph, node)) if stated_bias is None else stated_bias
     groups = node.attributes.get("group", 1)
     split = weight.reshape(groups, -1, *weight.shape[1:])
     # A convolution has its weights as (O, I / groups, kh, kw), a transposed one as
@@ -306,7 +289,11 @@ def _fold(graph: OnnxGraph, node: Node, affine: Affine, into_results: bool) -> N
         bias = bias * scale.ravel() + shift.ravel()
     elif node.op_type == "Conv":  # `_may_take_in` lets no shift reach a transposed one
         bias = bias + (split * shift).sum(axis=(2, 3, 4)).ravel()
-    _set_weights(graph, node, (split * scale).reshape(weight.shape), bias)
+    # Of its own, because the old ones may serve others too.
+    name = node.proto.name or node.result
+    numbers = {"weight": (split * scale).reshape(weight.shape), "bias": bias}
+    names = [graph.add_constant(f"{name}.{role}", value) for role, value in numbers.items()]
+    node.inputs = (node.source, *names)
 
 
 def _may_take_in(graph: OnnxGraph, node: Node, name: str, affine: Affine) -> bool:

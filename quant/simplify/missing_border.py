@@ -17,7 +17,9 @@ from onnx import shape_inference
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
 
-WINDOWS = {"AveragePool", "Conv", "ConvTranspose", "MaxPool", "Pad"}
+WINDOWS = {"AveragePool", "Conv", "MaxPool"}
+"""Operators whose pads add pixels around a map; those of a transposed convolution cut its result.
+"""
 WHOLE_IMAGE = "Global", "Reduce"
 """How the names of operators begin that read the whole image."""
 SIZES_PX = (256, 320), (384, 512)
@@ -36,10 +38,12 @@ def with_missing_border(model: onnx.ModelProto) -> onnx.ModelProto:
     Returns:
         The network with a Pad in front; `model` itself if no border is missing.
     """
-    nodes = model.graph.node
-    windows = [node for node in nodes if node.op_type in WINDOWS]
+    nodes = OnnxGraph(model).nodes
     # Zeros that a layer pads with would lie beyond the mirrored border, not at the image's.
-    is_padded = any(map(_is_padded, windows))
+    is_padded = any(
+        node.op_type == "Pad" or (node.op_type in WINDOWS and any(node.attributes.get("pads", ())))
+        for node in nodes
+    )
     reads_all = any(node.op_type.startswith(WHOLE_IMAGE) for node in nodes)
     border_px = 0 if is_padded or reads_all else _missing_px(model)
     if not border_px:
@@ -63,18 +67,27 @@ def with_missing_border(model: onnx.ModelProto) -> onnx.ModelProto:
     return network
 
 
-def _is_padded(node: onnx.NodeProto) -> bool:
-    """Return True for a node that adds pixels around its map."""
-    states_pads = any(a.name == "pads" and any(a.ints) for a in node.attribute)
-    # The pads of a transposed convolution cut its result.
-    return node.op_type == "Pad" or (states_pads and node.op_type != "ConvTranspose")
-
-
 def _missing_px(model: onnx.ModelProto) -> int:
     """Return how many pixels of a border are missing at each side; 0 for none (1)."""
-    results = [_result_size(model, size) for size in SIZES_PX]
-    if not all(results):
+    dims = model.graph.input[0].type.tensor_type.shape.dim
+    if len(model.graph.input) != 1 or len(model.graph.output) != 1 or len(dims) != 4:
         return 0
+    results = []
+    for image_size in SIZES_PX:
+        network = deepcopy(model)
+        network.graph.ClearField("value_info")
+        dims = network.graph.input[0].type.tensor_type.shape.dim
+        for dim, side_px in zip(dims[2:], image_size, strict=True):
+            dim.dim_value = side_px
+        network.graph.output[0].type.tensor_type.ClearField("shape")
+        try:
+            inferred = shape_inference.infer_shapes(network)
+        except shape_inference.InferenceError:
+            return 0
+        size = sizes_of(inferred.graph.output[0].type.tensor_type)
+        if len(size) != 4 or min(size[2:]) < 1:
+            return 0
+        results.append(size[2:])
     small, large = np.array(results)
     sides, larger_sides = np.array(SIZES_PX)
     growth = (large - small) / (larger_sides - sides)
@@ -83,28 +96,3 @@ def _missing_px(model: onnx.ModelProto) -> int:
     borders = (sides - small / growth) / 2
     border_px = int(borders[0])
     return border_px if (borders == border_px).all() and 0 < border_px <= MOST_PX else 0
-
-
-def _result_size(model: onnx.ModelProto, size: tuple[int, int]) -> tuple[int, ...]:
-    """Return rows and columns of the result for an image of this size; empty if not known.
-
-    Args:
-        model: a float network of one input and one result.
-        size: rows and columns of the image.
-    """
-    if len(model.graph.input) != 1 or len(model.graph.output) != 1:
-        return ()
-    network = deepcopy(model)
-    network.graph.ClearField("value_info")
-    dims = network.graph.input[0].type.tensor_type.shape.dim
-    if len(dims) != 4:
-        return ()
-    for dim, side_px in zip(dims[2:], size, strict=True):
-        dim.dim_value = side_px
-    network.graph.output[0].type.tensor_type.ClearField("shape")
-    try:
-        inferred = shape_inference.infer_shapes(network)
-    except shape_inference.InferenceError:
-        return ()
-    sizes = sizes_of(inferred.graph.output[0].type.tensor_type)
-    return sizes[2:] if len(sizes) == 4 and min(sizes[2:]) > 0 else ()

@@ -305,9 +305,14 @@ def _of_our_opset(model: onnx.ModelProto) -> onnx.ModelProto:
         converted = version_converter.convert_version(model, OPSET)
     except (InferenceError, RuntimeError, ValueError):
         return model
-    if version < RESIZE_HAS_MODES:
-        _place_corners(converted)
     for node in converted.graph.node:
+        # Enlargements of older opsets start at the corner. The converter leaves the default, which
+        # is shifted by half a pixel.
+        if node.op_type == "Resize" and version < RESIZE_HAS_MODES:
+            modes = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+            attributes = [a for a in node.attribute if a.name not in modes]
+            attributes += [onnx.helper.make_attribute(*mode) for mode in modes.items()]
+            _replace(node.attribute, attributes)
         # The converter leaves it, though the operator of our opset has no such attribute.
         if node.op_type == "ReduceMean":
             _replace(node.attribute, [a for a in node.attribute if "noop" not in a.name])
@@ -315,19 +320,6 @@ def _of_our_opset(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 RESIZE_HAS_MODES = 11
-
-
-def _place_corners(model: onnx.ModelProto) -> None:
-    """Set the coordinates of enlargements from older opsets, which start at the corner.
-
-    The converter leaves the default, which is shifted by half a pixel.
-    """
-    for node in model.graph.node:
-        if node.op_type == "Resize":
-            modes = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
-            attributes = [a for a in node.attribute if a.name not in modes]
-            attributes += [onnx.helper.make_attribute(*mode) for mode in modes.items()]
-            _replace(node.attribute, attributes)
 
 
 def _tidy(network: onnx.ModelProto, model: onnx.ModelProto) -> None:

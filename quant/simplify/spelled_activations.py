@@ -108,7 +108,8 @@ def join_hard_swish(graph: OnnxGraph, node: Node) -> list[Node] | None:
     Returns:
         The activation; None if the node completes none.
     """
-    clipped = _sixth_of(graph, node) or ""
+    sixth = other_operand(graph, node, "Mul", 1 / 6) or other_operand(graph, node, "Div", 6)
+    clipped = sixth or ""
     shifted = _shifted_and_clipped(graph, clipped)
     if shifted is not None:
         return [node.replaced_by("HardSigmoid", [shifted], **SLOPE_AND_OFFSET)]
@@ -203,13 +204,6 @@ def _hard_sigmoid_of(graph: OnnxGraph, name: str) -> str | None:
     slope_and_offset = node.attributes.get("alpha", 0.2), node.attributes.get("beta", 0.5)
     is_of_hard_swish = np.allclose(slope_and_offset, (1 / 6, 0.5), atol=1e-6)
     return node.source if is_of_hard_swish else None
-
-
-def _sixth_of(graph: OnnxGraph, node: Node) -> str | None:
-    """Return the tensor of which a node computes a sixth."""
-    if node.op_type == "Div" and _scalar(graph, node, 1) == 6:
-        return node.source
-    return other_operand(graph, node, "Mul", 1 / 6)
 
 
 def _shifted_and_clipped(graph: OnnxGraph, name: str) -> str | None:
