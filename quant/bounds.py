@@ -1,5 +1,6 @@
 """Bound the integers of an INT8 network over all images, by interval arithmetic on its weights."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 
@@ -11,13 +12,13 @@ from beers_deploy.quant.graph import (
     PLANES,
     Add,
     AveragePool,
-    Concat,
     Mul,
     Op,
     Pointwise,
     Shuffle,
 )
 from beers_deploy.quant.integer.arithmetic import activated, activation_table, mean_factor
+from beers_deploy.quant.integer.reference import layer_sums, rounded
 
 Range = tuple[np.ndarray, np.ndarray]
 """The smallest and the largest integer of each channel."""
@@ -65,10 +66,9 @@ def layer_bounds(core: IntCore) -> list[LayerBound]:
     ranges: dict[str, Range] = {PLANES: (first, last)}
     bounds = []
     for op in core.ops:
-        low, high, shift = _accumulated(core, op, [ranges[name] for name in op.inputs])
+        low, high, shift = _accumulated(core, op, ranges)
         bits = float(np.log2(max(int(np.abs(low).max()), int(np.abs(high).max()), 1)))
-        low = _shifted(low, shift)
-        high = _shifted(high, shift)
+        low, high = (rounded(end, shift, half_even=False)[0] for end in (low, high))
         ranges[op.output] = np.clip(low, INT8_MIN, INT8_MAX), np.clip(high, INT8_MIN, INT8_MAX)
         bounds.append(LayerBound(op.name, bits, int(low.min()), int(high.max())))
     return bounds
@@ -91,18 +91,15 @@ Accumulated = tuple[np.ndarray, np.ndarray, int]
 """The interval of the accumulators, including zero padding, and the shift to int8."""
 
 
-def _accumulated(core: IntCore, op: IntConv | Op, inputs: list[Range]) -> Accumulated:
+def _accumulated(core: IntCore, op: IntConv | Op, ranges: Mapping[str, Range]) -> Accumulated:
+    inputs = [ranges[name] for name in op.inputs]
     if isinstance(op, IntConv):
         return _conv(core, op, inputs[0])
     if isinstance(op, Add):
-        finest = max(core.frac_bits[name] for name in op.inputs)
-        shifts = [finest - core.frac_bits[name] for name in op.inputs]
-        ends = (
-            sum(span[k].astype(np.int64) << s for span, s in zip(inputs, shifts, strict=True))
-            for k in (0, 1)
-        )
-        (low, finer), (high, _) = (activated(np.asarray(e), op.activation, finest) for e in ends)
-        return low, high, finest - core.frac_bits[op.output] + finer
+        # A sum rises with each term, so its extremes are the sums of the ends.
+        lows, highs = ({name: ranges[name][k] for name in op.inputs} for k in (0, 1))
+        low, shift, *_ = layer_sums(core, op, lows)
+        return low, layer_sums(core, op, highs)[0], shift
     if isinstance(op, Mul):
         # A product is linear in each factor, so its extremes lie at the ends of both intervals.
         corners = np.array([a.astype(np.int64) * b for a, b in product(inputs[0], inputs[1])])
@@ -123,8 +120,6 @@ def _accumulated(core: IntCore, op: IntConv | Op, inputs: list[Range]) -> Accumu
 def _moved(core: IntCore, op: Op, inputs: list[Range]) -> Range:
     """Compute the range of an operation that only moves values or looks them up."""
     low, high = (np.concatenate([ends[k] for ends in inputs]) for k in (0, 1))
-    if isinstance(op, Concat):
-        return low, high
     if isinstance(op, Pointwise):
         table = activation_table(op, core.frac_bits)
         spans = [table[a - INT8_MIN : b - INT8_MIN + 1] for a, b in zip(low, high, strict=True)]
@@ -158,8 +153,3 @@ def _conv(core: IntCore, op: IntConv, source: Range) -> Accumulated:
         activated(end, op.activation, product_bits) for end in (least, most)
     )
     return least, most, product_bits - core.frac_bits[op.output] + finer
-
-
-def _shifted(sums: np.ndarray, shift: int) -> np.ndarray:
-    # The half before the shift makes ties round up, as the DPU rounds its results.
-    return sums << -shift if shift <= 0 else (sums + (1 << (shift - 1))) >> shift

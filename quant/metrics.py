@@ -28,14 +28,16 @@ class Metric:
     value: Callable[[np.ndarray, np.ndarray], float]
 
 
-def _similarity(result: np.ndarray, reference: np.ndarray) -> float:
-    # SSIM is that of one band, so it is the mean over the bands.
-    return float(np.mean([ssim(*pair, 1.0) for pair in zip(result[0], reference[0], strict=True)]))
-
-
 METRICS: Mapping[str, Metric] = {
     "psnr": Metric("dB", True, lambda result, reference: psnr_db(result, reference, 1.0)),
-    "ssim": Metric("ratio", True, _similarity),
+    # SSIM is that of one band, so it is the mean over the bands.
+    "ssim": Metric(
+        "ratio",
+        True,
+        lambda result, reference: float(
+            np.mean([ssim(*pair, 1.0) for pair in zip(result[0], reference[0], strict=True)])
+        ),
+    ),
     "mae": Metric(SCALE, False, lambda result, reference: float(np.abs(result - reference).mean())),
 }
 

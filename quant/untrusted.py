@@ -159,16 +159,9 @@ def _check_tensor(tensor: TensorProto, where: str) -> None:
             f"The weights {printable(repr(tensor.name))} in {where} state {times(tensor.dims)} "
             f"values, but the file holds {stored_count:g}. Copy or export it again."
         )
-    _check_finite(tensor, where)
-
-
-def _check_finite(tensor: TensorProto, where: str) -> None:
-    """Raise ModelError if weights are not finite.
-
-    A single number may be infinite, for example as a bound of Clip, but not NaN.
-    """
-    if tensor.data_type not in FLOATS:
+    if kind not in FLOATS:
         return
+    # A single number may be infinite, for example as a bound of Clip, but not NaN.
     values = numpy_helper.to_array(tensor)
     missing = np.isnan(values) if not tensor.dims else ~np.isfinite(values)
     if missing.any():

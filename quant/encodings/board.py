@@ -8,7 +8,6 @@ few steps.
 
 import json
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -189,8 +188,14 @@ def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> on
     side_px = required_tile(tile_px, OF_NPU)
     parts: list[tuple[IntConv | Op, int]] = []
     for op in core.ops:
-        # An operation and its clamp share the scale of the result, so that no bit changes.
-        parts += [(part, core.frac_bits[op.output]) for part in _apart(op)]
+        frac_bits = core.frac_bits[op.output]
+        part = op
+        if isinstance(op, IntConv | Add) and op.activation in CLAMPS:
+            # An operation and its clamp share the scale of the result, so that no bit changes.
+            inner = f"{op.output}.linear"
+            parts.append((replace(op, output=inner, activation=Activation.none), frac_bits))
+            part = Pointwise(f"{op.name}.{op.activation.name}", inner, op.output, op.activation)
+        parts.append((part, frac_bits))
     writer = _PairWriter(
         {PLANES: core.frac_bits[PLANES], **{op.output: bits for op, bits in parts}}
     )
@@ -215,17 +220,6 @@ def required_tile(tile_px: int | None, use: str) -> int:
     if tile_px is None:
         raise OptionError(f"`tile` must be given for {use}. Give a side in pixels, such as 640.")
     return tile_px
-
-
-def _apart(op: IntConv | Op) -> Iterator[IntConv | Op]:
-    """Yield an operation, and the clamp behind it as a separate operation."""
-    if not isinstance(op, IntConv | Add) or op.activation not in CLAMPS:
-        yield op
-        return
-    inner = f"{op.output}.linear"
-    kind = op.activation
-    yield replace(op, output=inner, activation=Activation.none)
-    yield Pointwise(f"{op.name}.{kind.name}", inner, op.output, kind)
 
 
 class _PairWriter(BoardWriter):

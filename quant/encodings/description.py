@@ -54,7 +54,12 @@ KINDS: dict[str, type] = {
 
 def describe(core: IntCore) -> str:
     """Describe a core as JSON for the metadata of its file, without weights and biases."""
-    ops = [{"kind": type(op).__name__, **_plain(op)} for op in core.ops]
+    ops = []
+    for op in core.ops:
+        fields = {"kind": type(op).__name__, **asdict(op)}  # type: ignore[arg-type]
+        if isinstance(op, IntConv):
+            fields |= {"weight": list(op.weight.shape), "bias": len(op.bias)}
+        ops.append(fields)
     return json.dumps(
         {
             "ops": ops,
@@ -63,13 +68,6 @@ def describe(core: IntCore) -> str:
         },
         sort_keys=True,
     )
-
-
-def _plain(op: IntConv | Op) -> dict[str, Any]:
-    fields = asdict(op)  # type: ignore[arg-type]
-    if isinstance(op, IntConv):
-        fields |= {"weight": list(op.weight.shape), "bias": len(op.bias)}
-    return fields
 
 
 def described_core(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:

@@ -78,7 +78,12 @@ def implicit_parts(model: onnx.ModelProto) -> dict[str, list[str]]:
     graph = model.graph
     opset = opset_of(model)
     ends = [*graph.input, *graph.output]
-    sized = {value.name for value in (*graph.value_info, *ends) if _is_sized(value)}
+    types = {value.name: value.type.tensor_type for value in (*graph.value_info, *ends)}
+    sized = {
+        name
+        for name, tensor in types.items()
+        if tensor.elem_type and all(dim.dim_value for dim in tensor.shape.dim)
+    }
     tensors = [value.name for value in graph.input]
     for node in graph.node:
         tensors += node.output
@@ -116,9 +121,3 @@ def _defaults(node: onnx.NodeProto, opset: int) -> Iterator[onnx.AttributeProto]
             yield attribute.default_value
         elif name in WINDOW_DEFAULTS:
             yield helper.make_attribute(name, WINDOW_DEFAULTS[name])
-
-
-def _is_sized(value: onnx.ValueInfoProto) -> bool:
-    """Return True if a tensor has a type, and a number for each of its sides."""
-    tensor = value.type.tensor_type
-    return bool(tensor.elem_type and all(dim.dim_value for dim in tensor.shape.dim))

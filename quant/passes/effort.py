@@ -14,7 +14,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from beers_deploy.quant.graph import Activation, Conv, Graph, Op, tensors
+from beers_deploy.quant.graph import Activation, Conv, Graph, tensors
 from beers_deploy.quant.host_part import HostPart
 from beers_deploy.quant.session import values_of
 
@@ -191,11 +191,11 @@ def work_of(graph: Graph, host_part: HostPart, crop: np.ndarray) -> list[int]:
     """
     # 1.
     (results,) = values_of(graph, tensors(graph), [crop], host_part)
-    return [result.size * _of_result(op) for op, result in zip(graph, results, strict=True)]
-
-
-def _of_result(op: Op) -> int:
-    if not isinstance(op, Conv):
-        return RESULT
-    rounding = LEAKY_RESULT if op.activation is Activation.leaky_relu else RESULT
-    return int(op.weight[0].size) + rounding
+    work = []
+    for op, result in zip(graph, results, strict=True):
+        of_value = RESULT
+        if isinstance(op, Conv):
+            rounding = LEAKY_RESULT if op.activation is Activation.leaky_relu else RESULT
+            of_value = int(op.weight[0].size) + rounding
+        work.append(result.size * of_value)
+    return work

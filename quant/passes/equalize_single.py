@@ -62,18 +62,6 @@ factor CLEARLY.
 """
 
 
-def _guess(ranges: np.ndarray, weights: np.ndarray, gamma: float, headroom: float) -> np.ndarray:
-    """Return the factors (C,) of step 2.
-
-    Otherwise a channel that is rarely active would be amplified until its weights determined the
-    scale of all. `weights` are the largest of those that write each channel.
-    """
-    factors = first_guess(ranges, gamma, headroom)
-    # The weights that write a tensor share one scale, which the largest of them sets.
-    limit = (weights * factors)[ranges >= np.median(ranges)].max()
-    return np.asarray(np.minimum(factors, limit / np.maximum(weights, 1e-12)))
-
-
 @dataclass(frozen=True)
 class SingleTensors:
     """Tensors that only convolutions write and read, so that each may be equalised by itself.
@@ -233,7 +221,14 @@ def equalize_single(
                 candidate = best.factors.copy()
                 for name in names:
                     part = parts[name]
-                    candidate[part] = _guess(ranges[part], weights_of[name], *shape)
+                    weights = weights_of[name]
+                    factors = first_guess(ranges[part], *shape)
+                    # 2. The weights that write a tensor share one scale, which the largest of them
+                    # sets. A channel that is rarely active would otherwise be amplified until its
+                    # weights determined the scale of all.
+                    stronger = ranges[part] >= np.median(ranges[part])
+                    limit = (weights * factors)[stronger].max()
+                    candidate[part] = np.minimum(factors, limit / np.maximum(weights, 1e-12))
                 best = _better(candidate, costs_of, best)
                 bar.advance()
         return best

@@ -54,8 +54,10 @@ def split_long_skip(graph: Graph) -> Graph:
     for add in graph:
         if isinstance(add, Add) and add.activation is Activation.none:
             head = _head(graph, add)
-            tail = _tail(graph, add)
-            if head is not None and tail is not None:
+            readers = [op for op in graph if add.output in op.inputs]
+            tail = readers[0] if len(readers) == 1 else None
+            ends_graph = isinstance(tail, Conv) and tail.output == CORRECTION and tail.groups == 1
+            if head is not None and isinstance(tail, Conv) and ends_graph:
                 # Weights that overflow are refused where the float network is run.
                 with np.errstate(over="ignore", invalid="ignore"):
                     return _split(graph, head, add, tail)
@@ -83,17 +85,6 @@ def _head(graph: Graph, add: Add) -> Conv | None:
             and all(side % 2 for side in op.weight.shape[2:])
         ):
             return op
-    return None
-
-
-def _tail(graph: Graph, add: Add) -> Conv | None:
-    """Return the last convolution if it alone reads a sum; else None."""
-    readers = [op for op in graph if add.output in op.inputs]
-    if len(readers) != 1:
-        return None
-    (tail,) = readers
-    if isinstance(tail, Conv) and tail.groups == 1 and tail.output == CORRECTION:
-        return tail
     return None
 
 

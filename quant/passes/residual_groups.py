@@ -92,7 +92,12 @@ def _placed(linking: Sequence[Op], names: Sequence[str], graph: Graph) -> Residu
         return dict.fromkeys(names, slice(None))
     planes = next(op.weight.shape[1] for op in graph if isinstance(op, Conv))
     widths = channels_of(graph, {PLANES: planes})
-    links = list(chain.from_iterable(_links(op, widths) for op in writers))
+    # Each input, the output, and where the input's channels stand in the output.
+    links: list[tuple[str, str, int]] = []
+    for op in writers:
+        before = accumulate((widths[name] for name in op.inputs[:-1]), initial=0)
+        offsets = before if isinstance(op, Concat) else repeat(0, len(op.inputs))
+        links += [(name, op.output, by) for name, by in zip(op.inputs, offsets, strict=True)]
     first = {names[0]: 0}
     # The tensors are linked to each other, so every sweep places at least one more.
     while len(first) < len(names):
@@ -108,13 +113,6 @@ def _placed(linking: Sequence[Op], names: Sequence[str], graph: Graph) -> Residu
     return {
         name: slice(start - least, start - least + widths[name]) for name, start in first.items()
     }
-
-
-def _links(op: Op, widths: Mapping[str, int]) -> list[tuple[str, str, int]]:
-    """Return each input, the output, and where the input's channels stand in the output."""
-    before = accumulate((widths[name] for name in op.inputs[:-1]), initial=0)
-    offsets = before if isinstance(op, Concat) else repeat(0, len(op.inputs))
-    return [(name, op.output, by) for name, by in zip(op.inputs, offsets, strict=True)]
 
 
 def exceeds_six(graph: Graph, group: ResidualGroup, frac_bits: Mapping[str, int]) -> bool:

@@ -218,11 +218,15 @@ class CropTrials:
         front = _Part(core, 0, start)
         values = _on_all_cores(lambda number: front(images[number]), range(len(images)))
         behind = _Part(core, stop, len(core.ops))
+        within = {op.output for op in core.ops[start:stop]} - {*live_tensors(core, stop)}
 
         def trial(candidate: Graph) -> Costs:
             rounded = self.core_of(candidate)
-            # A scale that has to move may move others, also far from what was changed.
-            if _same_outside(core, rounded, start, stop):
+            # Convolutions that were not rounded again are the same objects. A scale that has to
+            # move may move others, also far from what was changed.
+            same = [a is b for a, b in zip(core.ops, rounded.ops, strict=True)]
+            moved = {name for name, _ in core.frac_bits.items() ^ rounded.frac_bits.items()}
+            if all(same[:start]) and all(same[stop:]) and moved <= within:
                 return self._costs([_Part(rounded, start, stop), behind], values, rounded)
             return self._costs([_Part(rounded, 0, len(rounded.ops))], images, rounded)
 
@@ -271,16 +275,6 @@ class _Part:
         names = [each.name for each in self.session.get_outputs()]
         results = values | dict(zip(names, self.session.run(names, feeds), strict=True))
         return {name: results[name] for name in self.passed_on}
-
-
-def _same_outside(one: IntCore, other: IntCore, start: int, stop: int) -> bool:
-    """Return True if two cores have the same operations and scales outside a part."""
-    # Convolutions that were not rounded again are the same objects.
-    same = [a is b for a, b in zip(one.ops, other.ops, strict=True)]
-    within = {op.output for op in one.ops[start:stop]} - {*live_tensors(one, stop)}
-    scales = (core.frac_bits.items() for core in (one, other))
-    differing = {name for name, _ in set.symmetric_difference(*map(set, scales))}
-    return all(same[:start]) and all(same[stop:]) and differing <= within
 
 
 def _rms(values: np.ndarray) -> float:

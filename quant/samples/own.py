@@ -235,17 +235,16 @@ def read_samples(
             ) from error
     # Any network preserves a constant image, so a mean over such samples would hide errors. A map
     # of noise levels is constant in each sample.
-    textured = [s for s in samples if _contrast(s[1][0], ranges) >= LEAST_CONTRAST]
+    textured = [
+        (sample, pair)
+        for sample, pair in samples
+        if np.ptp(to_shares(pair[0], ranges), (2, 3)).max() >= LEAST_CONTRAST
+    ]
     if not textured:
         raise ImageError(
             f"All samples of {label} are constant, but samples need contrast. Give real images."
         )
     return OwnSamples(name, textured, ranges, stated)
-
-
-def _contrast(image: np.ndarray, ranges: Ranges) -> float:
-    """Return the largest share of its range that a channel of an image (1, C, h, w) spans."""
-    return float(np.ptp(to_shares(image, ranges), (2, 3)).max())
 
 
 def _finite(name: str, values: np.ndarray) -> np.ndarray:

@@ -134,7 +134,18 @@ def integer_bank(bank: Bank, scale: int, gain: float, kernels: Kernels = "fitted
     # Each further copy of a kernel makes up for the rounding errors of those before it.
     for kernel, _ in channels(kernels):
         if kernel:
-            weight = _of_filter(exact[kernel] + residual[kernel])
+            values = (exact[kernel] + residual[kernel]).ravel()
+            coarse = shaped(STEP_DN * values)
+            # The last plane holds half of the remainder, so this grid is twice as fine.
+            fine = shaped(PART * values)
+            # Their sum is 0, so the number of odd weights is even.
+            odd = np.flatnonzero(fine % PART)
+            parts = np.zeros_like(fine)
+            # One up, one down: the weights of each plane sum to 0, and flat ground gives 0.
+            parts[odd[::2]] = 1
+            parts[odd[1::2]] = -1
+            weight = np.stack([*_halves(coarse), (fine - parts) // PART, parts])
+            weight = weight.reshape(BANK_SLICES.planes, *exact[kernel].shape)
         else:
             # The image comes in its own steps, and from the coarse planes only.
             none = np.zeros(exact[0].shape, np.int64)
@@ -154,21 +165,6 @@ def _halves(weight: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.in
     """Return two integers of each weight, which add up to it."""
     # The coarse plane comes twice, so a weight of twice int8's size fits.
     return weight // 2, weight - weight // 2
-
-
-def _of_filter(kernel: Array) -> NDArray[np.int64]:
-    """Return weights (4, 7, 7) for a kernel (7, 7) of sum 0 that multiplies digital numbers."""
-    coarse = shaped(STEP_DN * kernel.ravel())
-    # The last plane holds half of the remainder, so this grid is twice as fine.
-    fine = shaped(PART * kernel.ravel())
-    # Their sum is 0, so the number of odd weights is even.
-    odd = np.flatnonzero(fine % PART)
-    parts = np.zeros_like(fine)
-    # One up, one down: the weights of each plane sum to 0, and flat ground gives 0.
-    parts[odd[::2]] = 1
-    parts[odd[1::2]] = -1
-    weight = np.stack([*_halves(coarse), (fine - parts) // PART, parts])
-    return weight.reshape(BANK_SLICES.planes, *kernel.shape)
 
 
 def shaped(values: Array) -> NDArray[np.int64]:

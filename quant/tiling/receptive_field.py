@@ -199,7 +199,17 @@ class _Walk:
         grids = [self._grids[name] for name in node.inputs if name in self._grids]
         at = AxisNode(node, self._axis, grids[0].extra if grids else 0, self._graph, self._shapes)
         if grids:
-            step = self._step(at, grids)
+            if node.op_type in AXIS_MAPS:
+                at.require(
+                    node.source in self._grids and len(grids) == 1,
+                    "has parameters that the image determines",
+                )
+                at.require(len(list(filter(None, node.outputs))) == 1, "returns positions as well")
+                step = AXIS_MAPS[node.op_type](at)
+            else:
+                _require_pointwise(at)
+                at.require(len(set(grids)) == 1, "combines tensors of different sizes")
+                step = AxisMap(Fraction(1), at.extra)
             at.require(step.growth > 0, "has no positive stride")
             self._steps.append((node, step))
             self._grids.update(
@@ -212,20 +222,6 @@ class _Walk:
             # A board's file dequantises its weights by such nodes.
             at.require(node.op_type in KEEPING, "reads constants only (fold them)")
             self._shapes[node.result] = self._shapes[node.source]
-
-    def _step(self, at: AxisNode, grids: list[_Grid]) -> AxisMap:
-        if at.node.op_type in AXIS_MAPS:
-            at.require(
-                at.node.source in self._grids and len(grids) == 1,
-                "has parameters that the image determines",
-            )
-            at.require(
-                len([name for name in at.node.outputs if name]) == 1, "returns positions as well"
-            )
-            return AXIS_MAPS[at.node.op_type](at)
-        _require_pointwise(at)
-        at.require(len(set(grids)) == 1, "combines tensors of different sizes")
-        return AxisMap(Fraction(1), at.extra)
 
     def _radius_px(self, output: str) -> int:
         """Return how far the pixels on which a cell of the lattice depends extend beyond
