@@ -52,7 +52,7 @@ from beers_deploy.quant.simplify.fold_affine import (
     per_channel,
 )
 from beers_deploy.quant.simplify.spelled_activations import gelu_gate_input, other_operand
-from beers_deploy.quant.simplify.standard_operators import Shapes, channels_in, float_shapes
+from beers_deploy.quant.simplify.standard_operators import float_shapes
 
 
 class Kind(StrEnum):
@@ -240,13 +240,13 @@ def replaced(
     graph = OnnxGraph(network)
     # Before the graph changes, because a SiLU is known by the Sigmoid in front of it.
     plan: dict[Node, list[Node]] = {}
-    shapes = float_shapes(graph)
+    graph.shapes = float_shapes(graph)
     for kind, nodes in nodes_by_kind(graph).items():
         if kind is Kind.attention and kind in approximated:
             for node in nodes:
                 plan |= aligned(graph, node)
         elif kind in approximated and kind is not Kind.padding:
-            plan |= {node: _approximation(shapes, graph, node, kind) for node in nodes}
+            plan |= {node: _approximation(graph, node, kind) for node in nodes}
         elif kind in exact and kind is Kind.hard_sigmoid:
             plan |= {node: _scaled_hard_sigmoid(graph, node) for node in nodes}
         elif kind in exact:
@@ -262,11 +262,10 @@ def replaced(
     return network
 
 
-def _approximation(shapes: Shapes, graph: OnnxGraph, node: Node, kind: Kind) -> list[Node]:
+def _approximation(graph: OnnxGraph, node: Node, kind: Kind) -> list[Node]:
     """Return the nodes of another function that replaces an operator.
 
     Args:
-        shapes: the sizes of each float tensor by name.
         graph: the graph that the node belongs to.
         node: the Mul of a SiLU or GELU, a Gelu, a Sigmoid, a Tanh, a LeakyReLU, a PReLU or a
             Resize.
@@ -283,7 +282,7 @@ def _approximation(shapes: Shapes, graph: OnnxGraph, node: Node, kind: Kind) -> 
         factor = int(Resizing.of(node, graph).factors[2])
         return enlarged_bilinearly(graph, node.inputs[0], factor, node)
     if kind is Kind.cubic:
-        return _cubic_convolution(shapes, graph, node)
+        return _cubic_convolution(graph, node)
     return [Node.new("LeakyRelu", node.inputs[:1], output, node.name, alpha=LEAKY_SLOPE)]
 
 
@@ -306,7 +305,7 @@ def _clipped_line(graph: OnnxGraph, node: Node) -> list[Node]:
     ]
 
 
-def _cubic_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node]:
+def _cubic_convolution(graph: OnnxGraph, node: Node) -> list[Node]:
     """Return a transposed convolution of the mirrored image in place of a bicubic Resize.
 
     The Resize remains where a sum reads it: the host computes that.
@@ -319,7 +318,7 @@ def _cubic_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Nod
             reader.inputs = tuple(convolved if name == result else name for name in reader.inputs)
     factor = int(Resizing.of(node, graph).factors[2])
     base = Base(factor=factor, mode="cubic")
-    weight = base.kernel(channels_in(shapes, image))
+    weight = base.kernel(graph.channels(image))
     mirrored = f"{result}.mirrored"
     border = np.array([0, 0, REACH_PX, REACH_PX] * 2)
     names = [

@@ -169,10 +169,12 @@ class OnnxGraph:
             not state the rank.
         readers: for each tensor the nodes that read it. A node that reads it twice is listed twice.
         writers: for each tensor the node that writes it.
+        shapes: the sizes of tensors by name, 0 for an unknown size; empty until they are inferred.
     """
 
     def __init__(self, model: onnx.ModelProto) -> None:
         self._model = model
+        self.shapes: dict[str, tuple[int, ...]] = {}
         functions = functions_of(model)
         self.constants = constants(model)
         nodes = [Node.of(node, functions) for node in model.graph.node]
@@ -254,6 +256,11 @@ class OnnxGraph:
             return {}
         values = (*graph.input, *graph.value_info, *graph.output)
         return {value.name: value.type.tensor_type for value in values}
+
+    def channels(self, name: str) -> int:
+        """Return the number of channels of a map (N, C, H, W); 0 if `shapes` does not state it."""
+        sizes = self.shapes.get(name, ())
+        return sizes[1] if len(sizes) == 4 else 0
 
     def n_reads(self, name: str) -> int:
         """Return the number of times a tensor is read, by nodes and as a result of the model."""

@@ -21,7 +21,7 @@ import onnx
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.fold_affine import fold_in_front
-from beers_deploy.quant.simplify.standard_operators import channels_in, float_shapes
+from beers_deploy.quant.simplify.standard_operators import float_shapes
 
 RISING = {"Clip", "LeakyRelu", "Relu"}
 ACTIVATIONS = RISING | {"HardSwish"}
@@ -71,11 +71,11 @@ def behind_convolutions(model: onnx.ModelProto) -> onnx.ModelProto:
     graph = OnnxGraph(network)
     if not any(_lacks_convolution(graph, node) for node in graph.nodes):
         return model
-    shapes = float_shapes(graph)
+    graph.shapes = float_shapes(graph)
 
     def with_copy(graph: OnnxGraph, node: Node) -> list[Node] | None:
         source = node.source
-        channels = channels_in(shapes, source)
+        channels = graph.channels(source)
         if not channels or not _lacks_convolution(graph, node):
             return None
         copy = f"{node.result}.copy"
@@ -87,7 +87,7 @@ def behind_convolutions(model: onnx.ModelProto) -> onnx.ModelProto:
         ]
 
     graph.rewrite(with_copy)
-    fold_in_front(graph, shapes)
+    fold_in_front(graph, graph.shapes)
     graph.save()
     return network
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
-from beers_deploy.quant.simplify.standard_operators import Shapes, channels_in
+from beers_deploy.quant.simplify.standard_operators import Shapes
 
 NORMALISATION = "BatchNormalization"
 LACKING = {NORMALISATION, "Div", "Neg"}
@@ -42,12 +42,11 @@ class Affine:
         return max(len(self.scale), len(self.shift))
 
 
-def add_negated(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+def add_negated(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a - b by a + (-b), where the convolution that computes b is negated, or a product by
     -1 is new (point 1 of the module).
 
     Args:
-        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
         graph: the graph that the node belongs to; its constants are extended.
         node: any node.
 
@@ -55,7 +54,7 @@ def add_negated(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | No
         The Add, behind a product where that is new; None if the node is no Sub of two float maps.
     """
     is_of_maps = graph.constants.keys().isdisjoint(node.inputs)
-    if node.op_type != "Sub" or not is_of_maps or node.inputs[1] not in shapes:
+    if node.op_type != "Sub" or not is_of_maps or node.inputs[1] not in graph.shapes:
         return None
     result = node.result
     before = graph.sole_writer(node.inputs[1])
@@ -114,7 +113,8 @@ def fold_in_front(graph: OnnxGraph, shapes: Shapes) -> None:
             continue
         source, affine = match
         # One channel times many constants would be many channels.
-        if affine.channels not in (1, channels_in(shapes, source)):
+        sizes = shapes.get(source, ())
+        if affine.channels not in (1, sizes[1] if len(sizes) == 4 else 0):
             continue
         if all(_may_take_in(graph, reader, result, affine) for reader in behind):
             for reader in behind:
@@ -127,12 +127,11 @@ def fold_in_front(graph: OnnxGraph, shapes: Shapes) -> None:
     graph.set_nodes([node for node in graph.nodes if node not in folded])
 
 
-def convolve_affine(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+def convolve_affine(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace what scales and shifts channels, could not be folded, and is more than a DPU's
     product or sum, by a convolution of one pixel (point 4 of the module).
 
     Args:
-        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
         graph: the graph that the node belongs to; its constants are extended.
         node: any node.
 
@@ -143,7 +142,7 @@ def convolve_affine(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] 
     # What stands in front may just have become a convolution, which takes this one in.
     replacement = fold_behind(graph, node)
     match = affine_of(graph, node)
-    channels = channels_in(shapes, match[0]) if match is not None else 0
+    channels = graph.channels(match[0]) if match is not None else 0
     if replacement is not None or match is None or not channels:
         return replacement
     source, affine = match

@@ -22,12 +22,11 @@ import numpy as np
 import onnx
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Rewriting, sizes_of
 from beers_deploy.quant.onnx.image_input import without_size
 from beers_deploy.quant.simplify.rearrangements import (
     OF_BLOCKS,
     RESHAPING,
-    Sizes,
     is_rearrangement,
     rearranged,
 )
@@ -128,32 +127,31 @@ def _of_size(model: onnx.ModelProto, rows: int, columns: int, fold: Fold) -> onn
     network = fold(network)
     network.graph.ClearField("value_info")
     graph = OnnxGraph(network)
-    sizes = {name: sizes_of(tensor) for name, tensor in graph.tensor_types().items()}
-    graph.rewrite(lambda graph, node: _sized(graph, node, sizes))
+    graph.shapes = {name: sizes_of(tensor) for name, tensor in graph.tensor_types().items()}
+    graph.rewrite(_sized)
     graph.save()
     return fold(network)
 
 
-def _sized(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
+def _sized(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Return the nodes that replace a node whose input has a known size (2).
 
     Args:
         graph: the graph that the node belongs to; its constants are extended.
         node: any node.
-        sizes: the sizes of each tensor, for the images that are tried.
 
     Returns:
         The nodes with the same result; None if the node stays.
     """
     source = node.source
-    before = sizes.get(source, ())
-    after = sizes.get(node.result, ())
+    before = graph.shapes.get(source, ())
+    after = graph.shapes.get(node.result, ())
     if node.op_type == "Transpose" or (node.op_type in RESHAPING and before != after):
-        return rearranged(graph, node, sizes)
+        return rearranged(graph, node)
     if len(before) != 4 or len(after) != 4 or min(*before, *after) < 1:
         return None
     if node.op_type in SPECIAL:
-        return SPECIAL[node.op_type](graph, node, sizes)
+        return SPECIAL[node.op_type](graph, node)
     keeps_all = (
         node.op_type == "Slice"
         and before == after
@@ -165,10 +163,10 @@ def _sized(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
     return None
 
 
-def _with_pads(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
+def _with_pads(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Return a strided window with its pads in place of auto_pad SAME; None if it states them."""
     weight = graph.value(node, 1)
-    _, _, rows, columns = sizes[node.source]
+    _, _, rows, columns = graph.shapes[node.source]
     match = node.window(() if weight is None else weight.shape[2:], (rows, columns))
     if match is None or not _leaves_pads(node):
         return None
@@ -183,12 +181,12 @@ def _leaves_pads(node: Node) -> bool:
     )
 
 
-def _by_factors(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
+def _by_factors(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Return a Resize by factors in place of one to a size; None if no whole number divides one of
     the sizes into the other, so that factors may be rounded, and the result have another size.
     """
-    before = sizes[node.source]
-    factors = np.divide(sizes[node.result], before)
+    before = graph.shapes[node.source]
+    factors = np.divide(graph.shapes[node.result], before)
     if len(node.inputs) < 4 or any(factor % 1 and (1 / factor) % 1 for factor in factors):
         return None
     scales = graph.add_constant(f"{node.name}.scales", factors)
@@ -200,29 +198,29 @@ def _by_factors(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None
     return [node.replaced_by("Resize", inputs, **attributes)]
 
 
-def _expanded(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
+def _expanded(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Return nothing but another name for an Expand without effect, or the convolution that repeats
     a map of one channel; None for other Expands.
     """
     source = node.source
     result = node.result
-    before = sizes[source]
-    after = sizes[result]
-    if before == after or _is_broadcast_anyway(graph, node, sizes):
+    before = graph.shapes[source]
+    after = graph.shapes[result]
+    if before == after or _is_broadcast_anyway(graph, node):
         return [node.replaced_by("Identity", [source])]
     if before[1] > 1 or before[2:] != after[2:]:
         return None
     return [graph.convolution(source, result, node.name, np.ones((after[1], 1, 1, 1)))]
 
 
-def _is_broadcast_anyway(graph: OnnxGraph, node: Node, sizes: Sizes) -> bool:
+def _is_broadcast_anyway(graph: OnnxGraph, node: Node) -> bool:
     """Return True if all readers of an Expand are arithmetic that broadcasts to the same size."""
     result = node.result
     # What another Expand enlarges may be small itself, so it does not count.
     large = {
         name
-        for name, size in sizes.items()
-        if size == sizes[result]
+        for name, size in graph.shapes.items()
+        if size == graph.shapes[result]
         and (name not in graph.writers or graph.writers[name].op_type != "Expand")
     }
     return result not in graph.outputs and all(
@@ -231,20 +229,19 @@ def _is_broadcast_anyway(graph: OnnxGraph, node: Node, sizes: Sizes) -> bool:
     )
 
 
-def _with_written_maps(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
+def _with_written_maps(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Return a Concat whose constant maps are written by convolutions with weights of zero.
 
     Args:
         graph: the graph that the node belongs to; its constants are extended.
         node: the Concat. The convolutions read its first input.
-        sizes: the sizes of each tensor.
 
     Returns:
         The convolutions and the Concat, None if a constant is no map of one number a channel.
     """
     source = node.source
-    before = sizes[source]
-    after = sizes[node.result]
+    before = graph.shapes[source]
+    after = graph.shapes[node.result]
     maps = {name: graph.constants[name] for name in node.inputs if name in graph.constants}
     is_map = all(
         value.ndim == 4 and value.shape[2:] == after[2:] and (value == value[..., :1, :1]).all()
@@ -264,7 +261,7 @@ def _with_written_maps(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node]
     return [*nodes, node]
 
 
-SPECIAL: dict[str, Callable[[OnnxGraph, Node, Sizes], list[Node] | None]] = {
+SPECIAL: dict[str, Rewriting] = {
     "Concat": _with_written_maps,
     "Expand": _expanded,
     "Resize": _by_factors,

@@ -16,7 +16,6 @@ from math import prod
 import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
-from beers_deploy.quant.simplify.standard_operators import Shapes
 
 POINTWISE = {"Clip", "Elu", "HardSigmoid", "HardSwish", "LeakyRelu", "Relu", "Sigmoid", "Tanh"}
 MOVES = {"Flatten", "Reshape", "Squeeze", "Transpose", "Unsqueeze"}
@@ -31,8 +30,7 @@ class ConnectByConvolutions:
     It remembers which tensors are flattened maps, and the maps that they were made from.
     """
 
-    def __init__(self, shapes: Shapes) -> None:
-        self._shapes = shapes
+    def __init__(self) -> None:
         self._maps: dict[str, tuple[str, Map]] = {}
 
     def __call__(self, graph: OnnxGraph, node: Node) -> list[Node] | None:
@@ -41,7 +39,7 @@ class ConnectByConvolutions:
         """
         name = node.source
         if self._flattens(graph, node):
-            channels, height, width = self._shapes[name][1:]
+            channels, height, width = graph.shapes[name][1:]
             self._maps[node.result] = name, (channels, height, width)
         if name not in self._maps or len(node.outputs) != 1:
             return None
@@ -67,7 +65,7 @@ class ConnectByConvolutions:
 
     def _flattens(self, graph: OnnxGraph, node: Node) -> bool:
         """Return True if a node makes (N, C H W) of a map whose size is known (1)."""
-        sizes = self._shapes.get(node.source, ()) if node.inputs else ()
+        sizes = graph.shapes.get(node.source, ())
         if len(sizes) != 4 or min(sizes[1:]) < 1:
             return False
         if node.op_type == "Flatten":
@@ -109,19 +107,18 @@ class ConnectByConvolutions:
         return [image, Node.new("Flatten", image.outputs, name, f"{name}.flat")]
 
 
-def connect_neighbours(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+def connect_neighbours(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a convolution along the channels of one pixel by one of that pixel (5).
 
     Args:
-        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
         graph: the graph that the node belongs to; its constants are extended.
         node: any node; the last one that moves values behind the convolution is replaced.
 
     Returns:
         The convolution and the activations behind it; None if the node is something else.
     """
-    (result, *_) = node.outputs
-    size = shapes.get(result, ())
+    result = node.result
+    size = graph.shapes.get(result, ())
     channels = size[1] if len(size) == 4 else 0
     if node.op_type not in MOVES or not channels or size[2:] != (1, 1):
         return None
@@ -130,9 +127,13 @@ def connect_neighbours(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Nod
     if convolution is None or convolution.op_type != "Conv" or len(convolution.inputs) != 2:
         return None
     # Nodes that move values keep the order of the channels, because each other size is 1.
-    _, before = _behind(graph, convolution.inputs[0], MOVES)
-    source = before.outputs[0] if before is not None else ""
-    if weight is None or weight.shape[:-1] != (1, 1) or shapes.get(source, ())[1:] != size[1:]:
+    _, before = _behind(graph, convolution.source, MOVES)
+    source = before.result if before is not None else ""
+    if (
+        weight is None
+        or weight.shape[:-1] != (1, 1)
+        or graph.shapes.get(source, ())[1:] != size[1:]
+    ):
         return None
     taps = weight.ravel()
     pad = len(taps) // 2
@@ -161,5 +162,5 @@ def _behind(graph: OnnxGraph, name: str, skipped: set[str]) -> tuple[list[Node],
     while node is not None and node.op_type in skipped:
         if node.op_type in POINTWISE:
             activations.insert(0, node)
-        node = graph.writers.get(node.inputs[0])
+        node = graph.writers.get(node.source)
     return activations, node

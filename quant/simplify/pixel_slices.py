@@ -12,24 +12,23 @@ Both are exact, and do not need the size of the image.
 import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
-from beers_deploy.quant.simplify.standard_operators import Shapes, slices_of
+from beers_deploy.quant.simplify.standard_operators import slices_of
 
 TO_THE_END = 1 << 30
 """A stop from this number on is that of a slice to the end."""
 
 
-def convolve_slice(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+def convolve_slice(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a Slice that crops a map, or selects every n-th pixel, by a depthwise convolution.
 
     Args:
-        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
         graph: the graph that the node belongs to; its constants are extended.
         node: any node.
 
     Returns:
         The convolution. None for any other Slice, and for any other node.
     """
-    size = shapes.get(node.source, ()) if node.op_type == "Slice" else ()
+    size = graph.shapes.get(node.source, ()) if node.op_type == "Slice" else ()
     cuts = slices_of(graph, node) if len(size) == 4 and size[1] else {}
     is_end = node.result in graph.outputs and cuts.get(2) == cuts.get(3)
     # The host crops the result of a network, also where it mirrored the image before.

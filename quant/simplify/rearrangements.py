@@ -19,8 +19,6 @@ import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 
-Sizes = dict[str, tuple[int, ...]]
-
 RESHAPING = {"Flatten", "Reshape", "Squeeze", "Unsqueeze"}
 """Operators that move no value."""
 MOVING = RESHAPING | {"Expand", "GatherND", "Tile", "Transpose"}
@@ -50,27 +48,26 @@ def is_rearrangement(graph: OnnxGraph, node: Node) -> bool:
     )
 
 
-def rearranged(graph: OnnxGraph, node: Node, sizes: Sizes) -> list[Node] | None:
+def rearranged(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Return the operator that does what a node and those in front of it do together.
 
     Args:
         graph: the graph that the node belongs to; its constants are extended.
         node: a Transpose, a Reshape, or another operator that moves no value.
-        sizes: the sizes of each tensor, for images of one size.
 
     Returns:
         The operator; None if there is none for them.
     """
     source, chain = _chain(graph, node)
-    before = sizes.get(source, ())
+    before = graph.shapes.get(source, ())
     result = node.result
-    after = sizes.get(result, ())
+    after = graph.shapes.get(result, ())
     if len(before) != 4 or len(after) != 4 or not 0 < math.prod(before) <= MOST_VALUES:
         return None
     image = np.arange(math.prod(before)).reshape(before)
     moved = image
     for each in chain:
-        moved = _moved(graph, moved, each, sizes[each.result])
+        moved = _moved(graph, moved, each, graph.shapes[each.result])
     if after[2] > before[2]:
         return _enlarged(graph, node, source, image, moved)
     block = before[2] // after[2]

@@ -9,19 +9,18 @@ import numpy as np
 import onnx
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
-from beers_deploy.quant.simplify.standard_operators import Shapes, channels_in, float_shapes
+from beers_deploy.quant.simplify.standard_operators import float_shapes
 
 HOST = {"Clip", "DepthToSpace"}
 """Operators that the host computes behind the sum with the image."""
 
 
-def repeat_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+def repeat_channels(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Let a convolution repeat the channels of a map that a Tile or arithmetic repeats.
 
     The image that is added at the end is left as it is: the host adds it to each channel.
 
     Args:
-        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
         graph: the graph that the node belongs to; its constants are extended.
         node: any node.
 
@@ -30,17 +29,17 @@ def repeat_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] 
     """
     source = node.source
     result = node.result
-    channels = channels_in(shapes, source)
+    channels = graph.channels(source)
     if node.op_type == "Tile":
         repeats = graph.value(node, 1)
         if repeats is None or not channels or np.delete(repeats, 1).tolist() != [1, 1, 1]:
             return None
         weight = np.tile(np.eye(channels), (int(repeats[1]), 1))[:, :, None, None]
         return [graph.convolution(source, result, node.name, weight)]
-    narrow = _narrow_input(shapes, graph, node)
+    narrow = _narrow_input(graph, node)
     if narrow is None:
         return None
-    channels = max(channels_in(shapes, name) for name in node.inputs)
+    channels = max(graph.channels(name) for name in node.inputs)
     name = f"{result}.repeated"
     repeated = graph.convolution(narrow, name, name, np.ones((channels, 1, 1, 1)))
     node.inputs = tuple(name if each == narrow else each for each in node.inputs)
@@ -84,16 +83,16 @@ def broadcasts_channels(model: onnx.ModelProto) -> bool:
         model: a float network of few kinds of operators, whose channels ONNX can infer.
     """
     graph = OnnxGraph(model)
-    shapes = float_shapes(graph)
-    return any(_narrow_input(shapes, graph, node) is not None for node in graph.nodes)
+    graph.shapes = float_shapes(graph)
+    return any(_narrow_input(graph, node) is not None for node in graph.nodes)
 
 
-def _narrow_input(shapes: Shapes, graph: OnnxGraph, node: Node) -> str | None:
+def _narrow_input(graph: OnnxGraph, node: Node) -> str | None:
     """Return the map of one channel that an Add, Mul or Sub repeats; None if there is none."""
     is_of_maps = graph.constants.keys().isdisjoint(node.inputs)
     if node.op_type not in ("Add", "Mul", "Sub") or not is_of_maps:
         return None
-    widths = [channels_in(shapes, name) for name in node.inputs]
+    widths = [graph.channels(name) for name in node.inputs]
     narrow = node.inputs[int(widths[0] > widths[1])]
     result = node.result
     readers = {reader.op_type for reader in graph.readers[result]}

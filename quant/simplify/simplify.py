@@ -165,21 +165,18 @@ def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 def _run_passes(model: onnx.ModelProto) -> None:
     """Rewrite the nodes of a network in place, without renaming its inputs and outputs."""
     graph = OnnxGraph(model)
-    for replacement in (
-        clip_last,
-        choose_by_relu,
-        multiply_squares,
-        partial(drop_where, float_shapes(graph)),
-    ):
+    graph.shapes = float_shapes(graph)
+    for replacement in (clip_last, choose_by_relu, multiply_squares, drop_where):
         graph.rewrite(replacement)
     # What was replaced would count as a reader.
     graph.save()
+    graph.shapes = float_shapes(graph)
     for rewriting in (
         split_sums,
         join_clips,
         join_hard_swish,
         halve_before_gelu,
-        partial(add_negated, float_shapes(graph)),
+        add_negated,
         add_to_image,
         join_sigmoid,
         fold_behind,
@@ -188,8 +185,8 @@ def _run_passes(model: onnx.ModelProto) -> None:
     ):
         graph.rewrite(rewriting)
     graph.save()
-    shapes = float_shapes(graph)
-    fold_in_front(graph, shapes)
+    graph.shapes = float_shapes(graph)
+    fold_in_front(graph, graph.shapes)
     for with_shapes in (
         repeat_channels,
         drop_cast,
@@ -201,14 +198,13 @@ def _run_passes(model: onnx.ModelProto) -> None:
         unshuffle_slices,
         split_channels,
         convolve_slice,
+        # A normalisation that has become a convolution takes in what stands around it.
+        fold_behind,
     ):
-        graph.rewrite(partial(with_shapes, shapes))
-    # A normalisation that has become a convolution takes in what stands around it.
-    graph.rewrite(fold_behind)
-    fold_in_front(graph, shapes)
-    graph.rewrite(partial(read_unselected, shapes))
-    graph.rewrite(join_copies)
-    graph.rewrite(ConnectByConvolutions(shapes))
+        graph.rewrite(with_shapes)
+    fold_in_front(graph, graph.shapes)
+    for last in (read_unselected, join_copies, ConnectByConvolutions()):
+        graph.rewrite(last)
     graph.save()
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.fold_affine import is_convolution
-from beers_deploy.quant.simplify.standard_operators import Shapes, channels_in, slices_of
+from beers_deploy.quant.simplify.standard_operators import slices_of
 
 POINTWISE = {"HardSigmoid", "HardSwish", "LeakyRelu", "Relu", "Sigmoid", "Tanh"}
 CHANNEL_AXIS = (1, -3)
@@ -24,41 +24,39 @@ Part = tuple[str, np.ndarray]
 """The name of a part, and the numbers of its channels."""
 
 
-def split_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+def split_channels(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a Split, Slice or Gather of channels by operations that compute each part by itself
     (point 1 of the module).
 
     Args:
-        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
         graph: the graph that the node belongs to; its constants are extended.
         node: any node.
 
     Returns:
         The operations that replace the node; None if it does not split channels.
     """
-    parts = _parts(graph, node, shapes)
+    parts = _parts(graph, node)
     source = node.source if parts else ""
-    only_parts = all(_parts(graph, reader, shapes) for reader in graph.readers[source])
+    only_parts = all(_parts(graph, reader) for reader in graph.readers[source])
     divides = source not in graph.outputs and only_parts
     nodes: list[Node] = []
     for name, channels in parts:
-        nodes += _compute(graph, source, shapes, channels, name, divides)
+        nodes += _compute(graph, source, channels, name, divides)
     return nodes or None
 
 
-def _parts(graph: OnnxGraph, node: Node, shapes: Shapes) -> list[Part]:
+def _parts(graph: OnnxGraph, node: Node) -> list[Part]:
     """Return the parts of a map of known channels that a node selects; none for another node.
 
     Args:
         graph: the graph that the node belongs to.
         node: any node.
-        shapes: the shapes of each float tensor.
     """
-    numbers = np.arange(channels_in(shapes, node.source) if node.inputs else 0)
+    numbers = np.arange(graph.channels(node.source) if node.inputs else 0)
     if not len(numbers):
         return []
     if node.op_type == "Split" and node.attributes.get("axis", 0) in CHANNEL_AXIS:
-        widths = [channels_in(shapes, name) for name in node.outputs]
+        widths = [graph.channels(name) for name in node.outputs]
         if not all(widths):
             return []
         return list(zip(node.outputs, np.split(numbers, np.cumsum(widths[:-1])), strict=True))
@@ -70,14 +68,13 @@ def _parts(graph: OnnxGraph, node: Node, shapes: Shapes) -> list[Part]:
 
 
 def _compute(
-    graph: OnnxGraph, source: str, shapes: Shapes, channels: np.ndarray, name: str, divides: bool
+    graph: OnnxGraph, source: str, channels: np.ndarray, name: str, divides: bool
 ) -> list[Node]:
     """Return the operations that compute some channels of a map.
 
     Args:
         graph: its constants are extended by the weights of the part.
         source: the map.
-        shapes: the shapes of each float tensor.
         channels: the numbers of the channels, (C,).
         name: the name of the part.
         divides: whether the map is never needed as a whole (2), or the channels are selected (3).
@@ -91,7 +88,7 @@ def _compute(
         # An activation works on each value by itself, and a depthwise kernel on each channel, so
         # that the map in front has parts too.
         reads_once = graph.n_reads(before.source) == 1
-        in_front = _compute(graph, before.source, shapes, channels, inner, reads_once)
+        in_front = _compute(graph, before.source, channels, inner, reads_once)
     if before is not None and is_pointwise:
         behind = Node.of(before.written())
         behind.proto.name = f"{name}.{before.op_type}"
@@ -106,7 +103,7 @@ def _compute(
         front = inner if in_front else before.source
         conv = graph.convolution(front, name, f"{name}.Conv", weight, bias, **attributes)
         return [*in_front, conv]
-    weight = np.eye(shapes[source][1])[channels][..., None, None]
+    weight = np.eye(graph.shapes[source][1])[channels][..., None, None]
     return [graph.convolution(source, name, f"{name}.Conv", weight)]
 
 
@@ -122,12 +119,11 @@ def _groups(graph: OnnxGraph, node: Node | None) -> int:
     return groups if groups == 1 or (groups == outputs and inputs == 1) else 0
 
 
-def read_unselected(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+def read_unselected(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Let a convolution behind a concat read whole maps in place of selections of most of their
     channels (point 4 of the module).
 
     Args:
-        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
         graph: the graph that the node belongs to; its constants are extended.
         node: any node.
 
@@ -142,7 +138,7 @@ def read_unselected(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] 
     columns: list[np.ndarray] = []
     first = 0
     for name in joined.inputs:
-        width = channels_in(shapes, name)
+        width = graph.channels(name)
         part = weight[:, first : first + width]
         first += width
         before = graph.sole_writer(name)

@@ -32,17 +32,6 @@ def float_shapes(graph: OnnxGraph) -> Shapes:
     }
 
 
-def channels_in(shapes: Shapes, name: str) -> int:
-    """Return the number of channels of a map (N, C, H, W); 0 if it is not known.
-
-    Args:
-        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
-        name: the name of the map.
-    """
-    sizes = shapes.get(name, ())
-    return sizes[1] if len(sizes) == 4 else 0
-
-
 def slices_of(graph: OnnxGraph, node: Node) -> dict[int, slice]:
     """Return which part of each axis a Slice of a tensor of four axes selects.
 
@@ -137,11 +126,10 @@ def multiply_squares(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return [node.replaced_by("Mul", [node.source] * 2)]
 
 
-def drop_where(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+def drop_where(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Remove a Where by a constant that chooses one of two maps everywhere, as torch writes a lerp.
 
     Args:
-        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
         graph: the graph that the node belongs to.
         node: any node.
 
@@ -154,27 +142,26 @@ def drop_where(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | Non
     source = node.inputs[1] if chooses.item() else node.inputs[2]
     result = node.result
     # A smaller map would have been repeated.
-    is_of_size = source in shapes and shapes[source] == shapes.get(result)
+    is_of_size = source in graph.shapes and graph.shapes[source] == graph.shapes.get(result)
     if graph.sole_writer(source) is None or not is_of_size:
         return None
     graph.rename(source, result)
     return []
 
 
-def drop_cast(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+def drop_cast(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Remove a Cast to float32 of a tensor that is float32 already.
 
     onnxruntime leaves such a Cast if it writes a result.
 
     Args:
-        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
         graph: the graph that the node belongs to.
         node: any node.
 
     Returns:
         An empty list if the node is removed; None if it stays.
     """
-    if node.op_type != "Cast" or node.source not in shapes:
+    if node.op_type != "Cast" or node.source not in graph.shapes:
         return None
     if graph.sole_writer(node.source) is None or node.attributes["to"] != TensorProto.FLOAT:
         return None
@@ -182,20 +169,18 @@ def drop_cast(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None
     return []
 
 
-def pool_mean(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+def pool_mean(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a mean over rows and columns by GlobalAveragePool, and a Flatten if both axes are
     dropped, and a sum or mean over channels by a convolution of one pixel.
 
     Args:
-        shapes: the sizes of each float tensor by name, as `float_shapes` returns them. That of a
-            new tensor is added.
-        graph: the graph that the node belongs to.
+        graph: the graph that the node belongs to, to whose shapes that of a new tensor is added.
         node: any node.
 
     Returns:
         The nodes that replace the mean; None if the node is something else.
     """
-    size = shapes.get(node.source, ()) if node.op_type in ("ReduceMean", "ReduceSum") else ()
+    size = graph.shapes.get(node.source, ()) if node.op_type in ("ReduceMean", "ReduceSum") else ()
     # From opset 18 on the axes are an input.
     axes = {axis % 4 for axis in graph.numbers(node, 1, "axes") or ()} if size else set()
     (output, *_) = node.outputs
@@ -212,19 +197,18 @@ def pool_mean(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None
     if node.attributes.get("keepdims", 1):
         return [Node.new("GlobalAveragePool", node.inputs[:1], output, node.proto.name)]
     pooled = f"{output}.pooled"
-    shapes[pooled] = (*size[:2], 1, 1)
+    graph.shapes[pooled] = (*size[:2], 1, 1)
     return [
         Node.new("GlobalAveragePool", node.inputs[:1], pooled, node.proto.name),
         Node.new("Flatten", [pooled], output, f"{output}.flat"),
     ]
 
 
-def pool_maximum(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+def pool_maximum(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a maximum over rows and columns of known number by a MaxPool, and one over channels
     by maxima of two halves, until one channel is left: max(a, b) = b + ReLU(a - b).
 
     Args:
-        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
         graph: the graph that the node belongs to; its constants are extended.
         node: any node.
 
@@ -233,11 +217,11 @@ def pool_maximum(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | N
     """
     if node.op_type not in ("GlobalMaxPool", "ReduceMax"):
         return None
-    source = node.inputs[0]
-    size = shapes.get(source, ())
+    source = node.source
+    size = graph.shapes.get(source, ())
     # From opset 18 on the axes are an input.
     axes = {axis % 4 for axis in graph.numbers(node, 1, "axes") or ()}
-    (result,) = node.outputs
+    result = node.result
     if len(size) != 4 or not node.attributes.get("keepdims", 1):
         return None
     is_global = node.op_type == "GlobalMaxPool" or axes == {2, 3}
@@ -266,13 +250,12 @@ def pool_maximum(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | N
     return nodes or [graph.convolution(source, result, node.name, np.ones((1, 1, 1, 1)))]
 
 
-def shrink_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+def shrink_by_convolution(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a Resize to every n-th part of rows and columns by a depthwise convolution.
 
     Its kernel of n x n pixels and stride n has the weights of the interpolation.
 
     Args:
-        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
         graph: the graph that the node belongs to; its constants are extended.
         node: any node.
 
@@ -280,7 +263,7 @@ def shrink_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[
         The convolution; None if the node is something else, or reads pixels beyond its block.
     """
     factors = graph.numbers(node, 2, "scales") if node.op_type == "Resize" else None
-    channels = channels_in(shapes, node.source) if factors else 0
+    channels = graph.channels(node.source) if factors else 0
     attribute = node.attributes.get
     where = attribute("coordinate_transformation_mode", "half_pixel")
     mode = attribute("mode", "nearest")

@@ -11,17 +11,16 @@ import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.fold_affine import is_convolution
-from beers_deploy.quant.simplify.standard_operators import Shapes, slices_of
+from beers_deploy.quant.simplify.standard_operators import slices_of
 
 BLOCKS = (2, 3, 4)
 
 
-def unshuffle_slices(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+def unshuffle_slices(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace slices of every n-th pixel that are concatenated by one pixel unshuffle (point 1 of
     the module).
 
     Args:
-        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
         graph: the graph that the node belongs to. Convolutions that read the result get other
             weights, because its channels may be in another order.
         node: any node; only a Concat can be replaced.
@@ -33,7 +32,7 @@ def unshuffle_slices(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node]
         return None
     origins = {_origin(graph, name)[0] for name in node.inputs}
     source, *others = origins
-    size = shapes.get(source, ())
+    size = graph.shapes.get(source, ())
     readers = graph.readers[node.result]
     takes_order = all(
         reader.op_type == "Conv"
