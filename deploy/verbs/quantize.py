@@ -234,7 +234,7 @@ def _notes(result: "Network", adapt: bool) -> list[str]:
     if KEY in about:
         notes.append(f"input range: {about[KEY]}")
     if adapt and ADAPTED not in about:
-        notes.append("`adapt` replaced nothing: the DPU computes all activations of the network")
+        notes.append("`adapt` replaced nothing: the DPU computes all operators of the network")
     try:
         _ = result.tiling
     except ModelError as error:
