@@ -52,7 +52,15 @@ from beers_deploy.quant.simplify.activations_first import (
     activations_first,
     behind_convolutions,
 )
+from beers_deploy.quant.simplify.channels import (
+    broadcasts_channels,
+    join_copies,
+    read_unselected,
+    repeat_channels,
+    split_channels,
+)
 from beers_deploy.quant.simplify.channels_first import channels_first
+from beers_deploy.quant.simplify.convolutions import split_large_kernel, without_groups
 from beers_deploy.quant.simplify.fold_affine import (
     add_negated,
     convolve_affine,
@@ -61,23 +69,15 @@ from beers_deploy.quant.simplify.fold_affine import (
 )
 from beers_deploy.quant.simplify.free_sizes import free_rectangle, free_sizes
 from beers_deploy.quant.simplify.fully_connected import ConnectByConvolutions, connect_neighbours
-from beers_deploy.quant.simplify.grouped_convolutions import without_groups
 from beers_deploy.quant.simplify.image_residual import add_to_image, clip_last
-from beers_deploy.quant.simplify.large_kernels import split_large_kernel
 from beers_deploy.quant.simplify.missing_border import with_missing_border
-from beers_deploy.quant.simplify.pixel_slices import convolve_slice
-from beers_deploy.quant.simplify.repeat_channels import (
-    broadcasts_channels,
-    join_copies,
-    repeat_channels,
-)
+from beers_deploy.quant.simplify.slices import convolve_slice, unshuffle_slices
 from beers_deploy.quant.simplify.spelled_activations import (
     halve_before_gelu,
     join_clips,
     join_hard_swish,
     join_sigmoid,
 )
-from beers_deploy.quant.simplify.split_channels import read_unselected, split_channels
 from beers_deploy.quant.simplify.standard_operators import (
     choose_by_relu,
     drop_cast,
@@ -89,7 +89,6 @@ from beers_deploy.quant.simplify.standard_operators import (
     shrink_by_convolution,
     split_sums,
 )
-from beers_deploy.quant.simplify.strided_slices import unshuffle_slices
 from beers_deploy.quant.untrusted import contradictions, held_tensors
 
 PLAIN = {

@@ -32,25 +32,6 @@ def float_shapes(graph: OnnxGraph) -> Shapes:
     }
 
 
-def slices_of(graph: OnnxGraph, node: Node) -> dict[int, slice]:
-    """Return which part of each axis a Slice of a tensor of four axes selects.
-
-    Args:
-        graph: the graph that the node belongs to.
-        node: a Slice.
-
-    Returns:
-        The slice of each axis that is cut, by the axis' number from 0 to 3; empty if other nodes
-        compute the positions.
-    """
-    starts, stops, axes, steps = (graph.numbers(node, place, "") for place in range(1, 5))
-    if not (starts and stops and axes) or steps is None:
-        return {}
-    steps = steps or [1] * len(axes)
-    cuts = map(slice, starts, stops, steps)
-    return {axis % 4: cut for axis, cut in zip(axes, cuts, strict=True)}
-
-
 def split_sums(_: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a Sum of several tensors by Adds of two, one after the other.
 

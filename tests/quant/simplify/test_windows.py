@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from beers_deploy.quant.graph import read_network, refusal
 from beers_deploy.quant.onnx.graph import OnnxGraph
 from beers_deploy.quant.session import open_session, result_of
-from beers_deploy.quant.simplify.large_kernels import (
+from beers_deploy.quant.simplify.convolutions import (
     LARGE_POSITIONS,
     MOST_POSITIONS,
     split_large_kernel,

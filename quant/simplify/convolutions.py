@@ -1,16 +1,21 @@
-"""Write a convolution of a large kernel as several of smaller ones, whose results are summed.
+"""Write convolutions in forms that a DPU computes.
 
-1. Each part has every m-th row of the kernel, so that it is dilated by m, with the smallest m that
-   `MOST_POSITIONS` allows. Its padding is the rest of the whole kernel's padding in front of its
-   first row and behind its last one.
-2. A convolution of one pixel sums the parts, channel by channel. Behind a sum by Adds a DPU has no
+1. Groups of several channels become one group, with weights of zero between them.
+2. Output padding of a transposed convolution becomes rows and columns of zeros at the end of the
+   kernel.
+3. A large kernel becomes several smaller ones, whose results are summed. Each part has every m-th
+   row of the kernel, so that it is dilated by m, with the smallest m that `MOST_POSITIONS` allows.
+   Its padding is the rest of the whole kernel's padding in front of its first row and behind its
+   last one.
+4. A convolution of one pixel sums the parts, channel by channel. Behind a sum by Adds a DPU has no
    activation but ReLU, and as the network's last operation it would have 8 bits.
 
-Where a part would begin or end inside the map, as with a kernel without padding, a depthwise
-convolution that reads one pixel crops the map first. All of it is exact except for the rounding of
-float32. A kernel is not split if one of its rows is too large. It is not split either if it has a
-side without padding and is longer than any target convolves with, because it may be that of a layer
-as large as its map, which targets compute in another way.
+All of it is exact except for the rounding of float32. A DPU also multiplies by the zeros of 1 and
+2. Where a part of a large kernel would begin or end inside the map, as with a kernel without
+padding, a depthwise convolution that reads one pixel crops the map first. A kernel is not split if
+one of its rows is too large. It is not split either if it has a side without padding and is longer
+than any target convolves with, because it may be that of a layer as large as its map, which targets
+compute in another way.
 """
 
 import numpy as np
@@ -24,6 +29,50 @@ LARGE_POSITIONS = 64
 """Height times width, 8 x 8, up to which a kernel is not split, because some targets compute it."""
 LONGEST_SIDE = 16
 """The longest side of a kernel that is split although a side has no padding."""
+
+
+def without_groups(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace a convolution of groups or output padding by one without.
+
+    Args:
+        graph: the graph that the node belongs to; its constants are extended.
+        node: any node.
+
+    Returns:
+        The convolution; None if the node is something else, or depthwise.
+    """
+    if not is_convolution(graph, node):
+        return None
+    weight = graph.constants[node.inputs[1]]
+    groups = node.attributes.get("group", 1)
+    rows, columns, *_ = node.output_padding
+    is_depthwise = node.op_type == "Conv" and weight.shape[1] == 1 and len(weight) == groups
+    auto_pad = node.attributes.get("auto_pad", "NOTSET")
+    states_pads = auto_pad == "NOTSET" and "output_shape" not in node.attributes
+    is_dilated = set(node.attributes.get("dilations", [1])) != {1}
+    if rows or columns:
+        if not states_pads or is_dilated:
+            return None
+    elif groups == 1 or is_depthwise:
+        return None
+    # Both kinds have their groups along the first axis: (O, I / groups, kh, kw), or transposed
+    # (I, O / groups, kh, kw).
+    in_groups = np.arange(len(weight)) * groups // len(weight)
+    dense = np.zeros((len(weight), groups, *weight.shape[1:]))
+    dense[np.arange(len(weight)), in_groups] = weight
+    dense = dense.reshape(len(weight), -1, *weight.shape[2:])
+    dense = np.pad(dense, [(0, 0), (0, 0), (0, rows), (0, columns)])
+    name = graph.add_constant(f"{node.name}.weight", dense)
+    attributes = {
+        **node.attributes,
+        "group": 1,
+        "kernel_shape": list(dense.shape[2:]),
+        "output_padding": [0, 0],
+    }
+    if node.op_type == "Conv":
+        del attributes["output_padding"]
+    inputs = [node.source, name, *node.inputs[2:]]
+    return [Node.new(node.op_type, inputs, node.result, node.proto.name, **attributes)]
 
 
 def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
@@ -55,7 +104,7 @@ def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
     name = node.proto.name or node.result
     nodes: list[Node] = []
     parts: list[str] = []
-    # 1.
+    # 3.
     for first in range(step):
         kernel = weight[:, :, first::step]
         # The part's last row lies this many rows above the last one of the whole kernel.
@@ -77,7 +126,7 @@ def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
         }
         nodes.append(graph.convolution(source, part, part, kernel, **attributes))
         parts.append(part)
-    # 2.
+    # 4.
     # The bias is added once, by the convolution that sums, so the parts have none.
     joined = Node.new("Concat", parts, f"{name}.rows", axis=1)
     ones = graph.add_constant(f"{name}.sum", np.tile(np.eye(outputs), step)[..., None, None])
