@@ -36,27 +36,29 @@ MIDDLE = 128
 UINT8_MAX = 255
 
 
+ZERO = 2
+"""The input with the zero point of the activations, of every operator in OPERATORS."""
+
+
 class Places(NamedTuple):
-    """The numbers of an integer operator's inputs that hold zero points and weights.
+    """The numbers of an integer operator's inputs that hold weights and zero points.
 
     Attributes:
-        zero: the input with the zero point of the activations.
         weight: the input with the weights.
         weight_zero: the input with the zero point of the weights.
         result_zero: the input with the zero point of the result; None for a result in int32.
     """
 
-    zero: int
     weight: int
     weight_zero: int
     result_zero: int | None
 
 
 OPERATORS = {
-    "QLinearConv": Places(2, 3, 5, 7),
-    "QLinearMatMul": Places(2, 3, 5, 7),
-    "ConvInteger": Places(2, 1, 3, None),
-    "MatMulInteger": Places(2, 1, 3, None),
+    "QLinearConv": Places(3, 5, 7),
+    "QLinearMatMul": Places(3, 5, 7),
+    "ConvInteger": Places(1, 3, None),
+    "MatMulInteger": Places(1, 3, None),
 }
 """ONNX's operators whose kernels multiply 8-bit numbers.
 
@@ -68,10 +70,10 @@ FLOAT_OPERATORS = {"Conv": "QLinearConv", "MatMul": "QLinearMatMul", "Gemm": "QL
 onnxruntime makes of each.
 """
 
-REQUANTISING = {"QLinearConv": 7, "QLinearAdd": 7}
-"""Operators whose result may be stored 128 lower if a ReLU follows, and the input that holds the
-zero point of that result.
-"""
+REQUANTISING = {"QLinearConv", "QLinearAdd"}
+"""Operators whose result may be stored 128 lower if a ReLU follows."""
+RESULT_ZERO = 7
+"""The input of these that holds the zero point of the result."""
 
 
 def with_exact_sums(model: onnx.ModelProto) -> onnx.ModelProto:
@@ -153,14 +155,14 @@ def _move_relu_down(largest: dict[str, int], graph: OnnxGraph, node: Node) -> li
         return None
     result = node.result
     writer = graph.sole_writer(node.source)
-    place = REQUANTISING.get(writer.op_type) if writer else None
-    if writer is None or place is None or not _holds(graph, writer, place, middle):
+    if writer is None or writer.op_type not in REQUANTISING:
         return None
     readers = graph.readers[result]
-    is_moved = result not in graph.outputs and all(
+    is_moved = _holds(graph, writer, RESULT_ZERO, middle) and result not in graph.outputs
+    is_moved = is_moved and all(
         reader.op_type in OPERATORS
         and reader.inputs.count(result) == 1
-        and _holds(graph, reader, OPERATORS[reader.op_type].zero, middle)
+        and _holds(graph, reader, ZERO, middle)
         for reader in readers
     )
     if not is_moved:
@@ -169,9 +171,9 @@ def _move_relu_down(largest: dict[str, int], graph: OnnxGraph, node: Node) -> li
     # upper end: 255 around the old zero point is 255 - middle around 0.
     zero = _constant(graph, np.uint8(0))
     largest[result] = UINT8_MAX - int(middle.item())
-    _set_input(writer, place, zero)
+    _set_input(writer, RESULT_ZERO, zero)
     for reader in readers:
-        _set_input(reader, OPERATORS[reader.op_type].zero, zero)
+        _set_input(reader, ZERO, zero)
     end = _constant(graph, np.uint8(largest[result]))
     return [node.replaced_by("Min", [node.source, end])]
 
@@ -206,11 +208,11 @@ def _add_exactly(largest: dict[str, int], graph: OnnxGraph, node: Node) -> list[
     if weight.dtype != np.int8 or cannot_saturate(node.op_type, weight, activations_end):
         return None
     _lift(graph, node, places.weight, places.weight_zero)
-    zero = graph.value(node, places.zero)
+    zero = graph.value(node, ZERO)
     if zero is None or zero.dtype != np.int8:
         return None
     # Signed activations are converted to uint8 before the node, and its result back behind it.
-    _lift(graph, node, places.zero)
+    _lift(graph, node, ZERO)
     source = f"{node.source}.unsigned"
     nodes = [node]
     # The activations are converted once for all their readers.

@@ -7,6 +7,7 @@ few steps.
 """
 
 import json
+import math
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -71,7 +72,9 @@ def _core_file(
     size = image_info(PLANES, host_part.planes, read_px)
     written = host_part.decoding.copies * host_part.outputs
     factor = host_part.base.factor
-    written_px = tile_px and (tile_px * factor + 2 * host_part.crop_px) // host_part.correction_px
+    # The side of the square of pixels that one pixel of the core's result becomes.
+    block_px = math.prod(shuffle.block for shuffle in host_part.back)
+    written_px = tile_px and (tile_px * factor + 2 * host_part.crop_px) // block_px
     result = image_info(CORRECTION, written, written_px)
     # A result that the image itself is not added to may have another size.
     if factor > 1 or not host_part.adds_image:

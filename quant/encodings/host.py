@@ -240,8 +240,7 @@ def _transposed(w: HostWriter, core: IntCore, op: IntConv) -> None:
     a crop of the pads.
     """
     stride = op.window.strides[0]
-    first_row = op.window.pads[0]
-    first_column = op.window.pads[1]
+    top, left, bottom, right = op.window.pads
     weight, reach = phases(op.weight, stride)
     phased = replace(
         op, output=f"{op.output}.phases", weight=weight, window=Window(pads=(reach,) * 4)
@@ -257,10 +256,10 @@ def _transposed(w: HostWriter, core: IntCore, op: IntConv) -> None:
     # The phases continue behind the last pixel: the rows and columns that the kernel does not reach
     # are cut as well.
     rows, columns = (stride * (reach + 1) - k for k in op.weight.shape[2:])
-    ends = [-(op.window.pads[2] + rows), -(op.window.pads[3] + columns)]
+    ends = [-(bottom + rows), -(right + columns)]
     # A stop of 0 would mean the first pixel, not the last.
     stops = [end if end else np.iinfo(np.int64).max for end in ends]
-    feeds = {"from": [first_row, first_column], "to": stops, "axes": [2, 3]}
+    feeds = {"from": [top, left], "to": stops, "axes": [2, 3]}
     places = [
         w.constant(f"{op.name}.{name}", np.array(value, np.int64)) for name, value in feeds.items()
     ]

@@ -147,13 +147,6 @@ class HostPart:
         """
         return math.prod(shuffle.block for shuffle in self.front)
 
-    @property
-    def correction_px(self) -> int:
-        """The side in pixels of the square that one pixel of the core's result becomes, when the
-        image is added.
-        """
-        return math.prod(shuffle.block for shuffle in self.back)
-
     def encode(self, image: np.ndarray) -> np.ndarray:
         """Encode an image as the int8 planes that the core reads.
 

@@ -23,9 +23,9 @@ ONNXRUNTIMES = {(MICROSOFT, "QLinearAdd"), (MICROSOFT, "QLinearMul")}
 """onnxruntime's own operators that this project writes."""
 
 WINDOWS = {"kernel_shape", "strides", "dilations", "pads", "output_padding", "blocksize"}
-SIZES = {"CenterCropPad": (1,), "Expand": (1,), "MaxUnpool": (2,), "OneHot": (1,), "Resize": (3,)}
+SIZES = {"CenterCropPad": 1, "Expand": 1, "MaxUnpool": 2, "OneHot": 1, "Resize": 3}
 """Operators with an input that states the size of the result, and that input."""
-FACTORS = {"Pad": (1,), "Resize": (2,), "Tile": (1,), "Upsample": (1,)}
+FACTORS = {"Pad": 1, "Resize": 2, "Tile": 1, "Upsample": 1}
 """Operators with an input that states the enlargement, and that input."""
 KEEPING = {
     "Cast",
@@ -197,17 +197,18 @@ def _check_growth(
     size is rejected, because it could be anything.
     """
     for places, absolute in ((SIZES, True), (FACTORS, False)):
-        for name in (node.input[i] for i in places.get(node.op_type, ()) if i < len(node.input)):
-            if not name or name in of_image:
-                continue
-            if name not in arrays:
-                raise _computed_size(node, where)
-            # At most one more than any list of sizes has.
-            values = [float(value) for value in arrays[name].ravel()[: 2 * RANK + 1]]
-            if absolute:
-                check_size(named(node), values, where)
-            elif not max(map(abs, values), default=0) <= WINDOW_PX:
-                raise ModelError(
-                    f"{printable(named(node))} in {where} enlarges by {times(values)}, but the "
-                    f"largest factor is {WINDOW_PX}. Export the network again."
-                )
+        place = places.get(node.op_type, len(node.input))
+        name = node.input[place] if place < len(node.input) else ""
+        if not name or name in of_image:
+            continue
+        if name not in arrays:
+            raise _computed_size(node, where)
+        # At most one more than any list of sizes has.
+        values = [float(value) for value in arrays[name].ravel()[: 2 * RANK + 1]]
+        if absolute:
+            check_size(named(node), values, where)
+        elif not max(map(abs, values), default=0) <= WINDOW_PX:
+            raise ModelError(
+                f"{printable(named(node))} in {where} enlarges by {times(values)}, but the "
+                f"largest factor is {WINDOW_PX}. Export the network again."
+            )
