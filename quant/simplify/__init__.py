@@ -6,7 +6,7 @@
   `quant.onnx.graph.OnnxGraph`;
 - `channels_first`, `free_sizes`, `missing_border`: passes on the image of a network: the order of
   its axes, arithmetic on its size, and the border that a network without padding lacks;
-- `rearrangements`: chains of nodes that only move values, for `free_sizes`;
+
 - `activations_first`: what must follow a convolution does;
 - `training_mode`: rejects networks that were exported in training mode.
 """
