@@ -83,28 +83,12 @@ def with_windows(
     for (result,) in values_of(graph, [CORRECTION], images, host_part):
         low = np.minimum(low, result[0].min((1, 2)))
         high = np.maximum(high, result[0].max((1, 2)))
-    offsets = window_offsets(low, high, 2.0 ** -(frac_bits + OffsetWindows.finer_bits))
-    windows = tuple(tuple(map(float, window)) for window in offsets)
-    return replace(host_part, decoding=OffsetWindows(windows))
-
-
-def window_offsets(low: np.ndarray, high: np.ndarray, unit: float) -> np.ndarray:
-    """Return the middles of the int8 windows that together cover a range, side by side.
-
-    Their number is at most MAX_WINDOWS, even if the range is too wide for so many.
-
-    Args:
-        low: (C,) the smallest value of each channel.
-        high: (C,) the largest value of each channel.
-        unit: the scale of the windows, in the unit of the values.
-
-    Returns:
-        (W, C) the middle of each window, in the unit of the values.
-    """
     # The coarse copy takes one of the places that a convolution's channels have.
     most = min(MAX_WINDOWS, MAX_CHANNELS // len(low) - 1)
     # A window is believed up to FINE_MAX units on either side of its middle.
+    unit = 2.0 ** -(frac_bits + OffsetWindows.finer_bits)
     needed = np.ceil((high - low).max() / (2 * FINE_MAX * unit))
     count = int(np.clip(needed, 1, max(most, 1)))
     shares = (np.arange(count)[:, None] + 0.5) / count
-    return np.asarray(low + shares * (high - low))
+    windows = tuple(tuple(map(float, window)) for window in low + shares * (high - low))
+    return replace(host_part, decoding=OffsetWindows(windows))

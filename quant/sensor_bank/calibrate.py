@@ -233,22 +233,20 @@ def quantize_behind_bank(
     plan = Plan(graph, host_part, groups, singles, shifts, passes, effort)
     body, _ = rounded(plan, images)
     biases = {}
-    for op in body.convolutions:
-        biases[op.name] = op.float_bias[:, None]
-        if op.input == PLANES:
-            # The planes of the sensor's values hold half of each.
+    behind_bank = []
+    for op in body.ops:
+        layer = op
+        if isinstance(op, IntConv):
+            biases[op.name] = op.float_bias[:, None]
+        if isinstance(op, IntConv) and op.input == PLANES:
+            # A sensor's values are constant, so their planes, which hold half of each, become part
+            # of the biases.
             values = op.weight[:, -SENSOR_VALUES:, 1, 1] * 2.0 ** -(op.weight_frac_bits + 1)
             biases[op.name] = np.concatenate([biases[op.name], values], 1)
-    # A sensor's values are constant, so their planes become part of the biases.
-    ops = tuple(
-        replace(op, weight=op.weight[:, :-SENSOR_VALUES])
-        if isinstance(op, IntConv) and op.input == PLANES
-        else op
-        for op in body.ops
-    )
-    # The body reads the bank's results as `PLANES`.
+            layer = replace(op, weight=op.weight[:, :-SENSOR_VALUES])
+        # The body reads the bank's results as `PLANES`.
+        behind_bank.append(renamed(layer, {PLANES: BANK, CORRECTION: BODY}))
     result = body.frac_bits[CORRECTION]
-    behind_bank = (renamed(op, {PLANES: BANK, CORRECTION: BODY}) for op in ops)
     # A concat has one scale for its inputs and its output.
     joined = Concat("joined", (BODY, ANALYTIC), CORRECTION)
     frac_bits = dict(body.frac_bits) | {BANK: BITS, BODY: result, ANALYTIC: result}
