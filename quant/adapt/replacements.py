@@ -25,6 +25,8 @@ And by another function again:
    Aligned corners are up to a quarter of a small pixel away.
 9. Bicubic enlargement of the image becomes a transposed convolution with the same weights. Where
    the original repeats the border of the image, the host mirrors it.
+10. The standard deviation over the image, in IMDN's attention, becomes the mean absolute deviation
+    (`quant.graph.deviation`).
 
 ELU, SELU and Softplus stay: lines that bend twice, by two ReLUs, lose 0.4 to 0.8 dB of U-Nets even
 if the convolutions behind are fitted.
@@ -40,6 +42,7 @@ import onnx
 from beers_deploy.quant.adapt.zero_padding import pad_by_zeros, pads_of
 from beers_deploy.quant.graph.attention import aligned, shrinking
 from beers_deploy.quant.graph.base import REACH_PX, Base
+from beers_deploy.quant.graph.deviation import deviation
 from beers_deploy.quant.graph.host_end import host_end
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
 from beers_deploy.quant.graph.resize import Resizing, alone_enlarges_image, enlarged_bilinearly
@@ -70,6 +73,7 @@ class Kind(StrEnum):
     padding = "reflecting padding"
     bilinear = "other bilinear enlargement"
     cubic = "bicubic enlargement"
+    deviation = "standard deviation over the image"
 
 
 APPROXIMATIONS = {
@@ -82,8 +86,9 @@ APPROXIMATIONS = {
     Kind.padding: "zeros around the mirrored image",
     Kind.bilinear: "bilinear by 4 and 2 with half-pixel centres",
     Kind.cubic: "a transposed convolution of the mirrored image",
+    Kind.deviation: "the mean absolute deviation",
 }
-"""The other function that replaces each kind (1 to 3, and 6 to 9)."""
+"""The other function that replaces each kind (1 to 3, and 6 to 10)."""
 EXACT = {
     Kind.hard_sigmoid: "HardSigmoid of a scaled input",
     Kind.leaky_relu: "ReLU in a second branch, and an Add",
@@ -110,6 +115,7 @@ def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
         Kind.attention: shrinking(graph, node),
         Kind.silu: silu_input(graph, node),
         Kind.padding: pads_of(graph, node),
+        Kind.deviation: node.op_type in ("Pow", "Sqrt") and deviation(graph, node),
         Kind.bilinear: resizing is not None and resizing.is_nearly_bilinear,
         Kind.cubic: alone_enlarges_image(graph, node),
     }
@@ -210,6 +216,7 @@ def nodes_by_kind(graph: OnnxGraph) -> dict[Kind, list[Node]]:
     order.
     """
     nodes: dict[Kind, list[Node]] = {}
+    graph.shapes = float_shapes(graph)
     on_host = host_end(graph).replaced
     for node in graph.nodes:
         kind = kind_of(graph, node)
@@ -240,7 +247,6 @@ def replaced(
     graph = OnnxGraph(network)
     # Before the graph changes, because a SiLU is known by the Sigmoid in front of it.
     plan: dict[Node, list[Node]] = {}
-    graph.shapes = float_shapes(graph)
     for kind, nodes in nodes_by_kind(graph).items():
         if kind is Kind.attention and kind in approximated:
             for node in nodes:
@@ -281,6 +287,8 @@ def _approximation(graph: OnnxGraph, node: Node, kind: Kind) -> list[Node]:
     if kind is Kind.bilinear:
         factor = int(Resizing.of(node, graph).factors[2])
         return enlarged_bilinearly(graph, node.inputs[0], factor, node)
+    if kind is Kind.deviation:
+        return deviation(graph, node)
     if kind is Kind.cubic:
         return _cubic_convolution(graph, node)
     return [Node.new("LeakyRelu", node.inputs[:1], output, node.name, alpha=LEAKY_SLOPE)]

@@ -12,6 +12,7 @@ import onnx
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph.attention import aligned, shrinking
+from beers_deploy.quant.graph.deviation import deviation
 from beers_deploy.quant.graph.host_end import host_end
 from beers_deploy.quant.graph.node_operations import ACTIVATIONS, READERS, read_activation, require
 from beers_deploy.quant.graph.operations import (
@@ -46,6 +47,7 @@ from beers_deploy.quant.graph.split_network import (
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.runnable import check_runnable
 from beers_deploy.quant.simplify.fold_affine import affine_of
+from beers_deploy.quant.simplify.standard_operators import float_shapes
 from beers_deploy.quant.untrusted import contradictions, times
 
 NO_IMAGE = (
@@ -129,26 +131,29 @@ class _Reader:
 
     def __init__(self, model: onnx.ModelProto) -> None:
         self.adaptable: AdaptableError | None = None  # the first
-        self.source = with_shuffles(self._aligned(model))
+        self.source = with_shuffles(self._with_attention(model))
         self.image, *_ = self.source.inputs
         self.ops: list[Op] = []
         self.border_px = self._take_mirror()
         self.end = host_end(self.source)
 
-    def _aligned(self, model: onnx.ModelProto) -> onnx.ModelProto:
-        """Return the model with spatial attention as `quant.adapt` aligns it, and note that."""
-        graph = OnnxGraph(model)
-        resizes = [node for node in graph.nodes if shrinking(graph, node)]
-        if not resizes:
-            return model
+    def _with_attention(self, model: onnx.ModelProto) -> onnx.ModelProto:
+        """Return the model with attention as `quant.adapt` replaces it, and note that."""
         network = deepcopy(model)
         graph = OnnxGraph(network)
-        plan = {}
+        graph.shapes = float_shapes(graph)
+        plan: dict[Node, list[Node]] = {}
         for node in graph.nodes:
-            plan.update(aligned(graph, node))
+            if shrinking(graph, node):
+                fault = f"{node} enlarges to the size of another map, by no whole factor."
+                plan.update(aligned(graph, node))
+            elif deviations := deviation(graph, node):
+                fault = f"The DPU does not compute the standard deviation over the image, {node}."
+                plan[node] = deviations
+        if not plan:
+            return model
         graph.rewrite(lambda _, node: plan.get(node))
         graph.save()
-        fault = f"{resizes[0]} enlarges to the size of another map, by no whole factor."
         self.adaptable = AdaptableError(str(unsupported(fault, ADAPT)))
         return network
 

@@ -86,6 +86,7 @@ from beers_deploy.quant.simplify.standard_operators import (
     multiply_squares,
     pool_maximum,
     pool_mean,
+    pool_sums,
     shrink_by_convolution,
     split_sums,
 )
@@ -190,6 +191,7 @@ def _run_passes(model: onnx.ModelProto) -> None:
         repeat_channels,
         drop_cast,
         pool_mean,
+        pool_sums,
         pool_maximum,
         connect_neighbours,
         shrink_by_convolution,

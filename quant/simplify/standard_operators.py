@@ -185,6 +185,32 @@ def pool_mean(graph: OnnxGraph, node: Node) -> list[Node] | None:
     ]
 
 
+def pool_sums(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace sums over rows and columns, divided by the number of pixels, by GlobalAveragePool.
+
+    Args:
+        graph: the graph that the node belongs to.
+        node: any node; the division is replaced.
+
+    Returns:
+        The mean; None if the node is something else, or the number is not known.
+    """
+    divisor = graph.value(node, 1) if node.op_type == "Div" else None
+    axes: set[int] = set()
+    name = node.source
+    total = graph.writers.get(name)
+    while total is not None and total.op_type == "ReduceSum":
+        if not total.attributes.get("keepdims", 1):
+            return None
+        axes.update(axis % 4 for axis in graph.numbers(total, 1, "axes") or ())
+        name = total.source
+        total = graph.writers.get(name)
+    size = graph.shapes.get(name, ())
+    if axes != {2, 3} or len(size) != 4 or divisor is None or (divisor != size[2] * size[3]).any():
+        return None
+    return [node.replaced_by("GlobalAveragePool", [name])]
+
+
 def pool_maximum(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a maximum over rows and columns of known number by a MaxPool, and one over channels
     by maxima of two halves, until one channel is left: max(a, b) = b + ReLU(a - b).

@@ -210,6 +210,32 @@ def attention_network(free: bool) -> onnx.ModelProto:
     return finished(w, None if free else 48)
 
 
+def contrast_network(px: int, factor: float) -> onnx.ModelProto:
+    """Build IMDN's attention (CCA) behind a convolution: its variance is scaled by a factor."""
+    w = GraphWriter()
+    source = conv(w, "image", "a", IMAGE_WEIGHTS)
+    rows, columns = (w.constant(f"axis{axis}", np.array([axis])) for axis in (2, 3))
+    count = w.constant("count", np.array(px**2, np.float32))
+    exponents = [w.constant(f"e{n}", np.array(n, np.float32)) for n in (2, 0.5)]
+
+    def mean(x: str, name: str) -> str:
+        inner = w.node("ReduceSum", f"{name}.s", [x, columns])
+        return w.node("Div", name, [w.node("ReduceSum", f"{name}.t", [inner, rows]), count])
+
+    average = mean(source, "mean")
+    difference = w.node("Sub", "difference", [source, average])
+    variance = mean(w.node("Pow", "square", [difference, exponents[0]]), "variance")
+    if factor != 1:
+        scale = w.constant("factor", np.array(factor, np.float32))
+        variance = w.node("Mul", "scaled", [variance, scale])
+    contrast = w.node("Add", "contrast", [w.node("Pow", "root", [variance, exponents[1]]), average])
+    gate = w.node("Sigmoid", "gate", [conv(w, contrast, "d", (FEATURES, FEATURES, 1, 1))])
+    attended = w.node("Mul", "attended", [source, gate])
+    correction = conv(w, attended, "e", RESULT_WEIGHTS)
+    w.node("Add", "restored", ["image", correction])
+    return finished(w, px)
+
+
 SAMPLES = patches(8, 0)
 HELD_OUT = patches(4, 1)
 BARE = Patches([(x, np.empty(0, np.float32)) for x in HELD_OUT.degraded], HELD_OUT.degraded)
@@ -508,6 +534,21 @@ def test_spatial_attention_is_aligned_and_compensated(free: bool) -> None:
     near = adapted.rows[-1].figures[TO_ORIGINAL].value
     assert near is not None
     assert near > 40
+
+
+@pytest.mark.parametrize("factor", [1, 4])
+def test_a_standard_deviation_becomes_the_mean_absolute_deviation(factor: float) -> None:
+    """The refusal names `adapt`, the network stays near, and the gate counts the ReLU for it."""
+    model = contrast_network(48, factor)
+    with pytest.raises(ModelError, match=r"standard deviation .* 'quantize --adapt'"):
+        read_network(model)
+    adapted = adapt(model, BARE, BARE)
+    assert adapted.rows[0].name == "1 standard deviation over the image"
+    near = adapted.rows[-1].figures[TO_ORIGINAL].value
+    assert near is not None
+    assert near > 50
+    int8 = quickly(adapted.model, BARE)
+    assert structure_checks(model, int8.host)[0].value == 0
 
 
 def enlarging(mode: str, where: str, factor: int, adds: bool) -> onnx.ModelProto:
