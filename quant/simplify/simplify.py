@@ -88,6 +88,7 @@ from beers_deploy.quant.simplify.standard_operators import (
     pool_mean,
     pool_sums,
     shrink_by_convolution,
+    split_soft_threshold,
     split_sums,
 )
 from beers_deploy.quant.untrusted import contradictions, held_tensors
@@ -166,7 +167,13 @@ def _run_passes(model: onnx.ModelProto) -> None:
     """Rewrite the nodes of a network in place, without renaming its inputs and outputs."""
     graph = OnnxGraph(model)
     graph.shapes = float_shapes(graph)
-    for replacement in (clip_last, choose_by_relu, multiply_squares, drop_where):
+    for replacement in (
+        clip_last,
+        split_soft_threshold,
+        choose_by_relu,
+        multiply_squares,
+        drop_where,
+    ):
         graph.rewrite(replacement)
     # What was replaced would count as a reader.
     graph.save()

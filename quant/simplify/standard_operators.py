@@ -55,6 +55,41 @@ def split_sums(_: OnnxGraph, node: Node) -> list[Node] | None:
     return adds
 
 
+def split_soft_threshold(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace a soft threshold, as unfolded optimisers such as ISTA-Net have it, by two ReLUs:
+    Sign(x) ReLU(Abs(x) - t) = ReLU(x - t) - ReLU(-x - t) for t >= 0.
+
+    Args:
+        graph: the graph that the node belongs to.
+        node: any node; the product is replaced.
+
+    Returns:
+        The nodes that replace the product; None if it is something else.
+    """
+    before = [graph.writers.get(name) for name in node.inputs] if node.op_type == "Mul" else []
+    by_type = {writer.op_type: writer for writer in before if writer is not None}
+    if by_type.keys() != {"Relu", "Sign"}:
+        return None
+    difference = graph.writers.get(by_type["Relu"].source)
+    threshold = graph.value(difference, 1) if difference is not None else None
+    if difference is None or difference.op_type != "Sub" or threshold is None:
+        return None
+    source = by_type["Sign"].source
+    size = graph.writers.get(difference.source)
+    if size is None or (size.op_type, size.source) != ("Abs", source) or (threshold < 0).any():
+        return None
+    parts = [f"{node.result}.{part}" for part in ("negative", "above", "below", "more", "less")]
+    negative, above, below, more, less = parts
+    return [
+        Node.new("Neg", [source], negative, negative),
+        Node.new("Sub", [source, difference.inputs[1]], above, above),
+        Node.new("Sub", [negative, difference.inputs[1]], below, below),
+        Node.new("Relu", [above], more, more),
+        Node.new("Relu", [below], less, less),
+        node.replaced_by("Sub", [more, less]),
+    ]
+
+
 def choose_by_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace the larger or the smaller of two maps, and the size of a map, by sums with ReLU:
     max(a, b) = a + ReLU(b - a), min(a, b) = a - ReLU(a - b), and abs(a) = ReLU(a) + ReLU(-a).

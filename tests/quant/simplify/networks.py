@@ -303,6 +303,14 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         y = Mul(u, x)""",
         {"GlobalAveragePool": 1, "Conv": 1, "HardSwish": 1, "Mul": 1},
     ),
+    "a soft threshold": (
+        """s = Sign(x)
+        a = Abs(x)
+        d = Sub(a, half)
+        r = Relu(d)
+        y = Mul(r, s)""",
+        {"Conv": 2, "Mul": 1, "Relu": 2, "Add": 1},
+    ),
     "three summed": (f"{CONV} d = {SAME}(c, w) y = Sum(x, c, d)", {"Conv": 2, "Add": 2}),
     "operators without an effect": (
         f"i = Identity(x) c = {SAME}(i, w) d = Dropout(c) y = Cast<to=1>(d)",
