@@ -14,6 +14,7 @@ import numpy as np
 
 import beers_deploy as bd
 from beers_deploy.model.curves import FREQUENCIES, Curve, pupil_contrast
+from beers_deploy.profiles.constant import Stated
 from beers_deploy.profiles.response import NYQUIST, MtfTable, Response
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import axes_of
@@ -55,10 +56,11 @@ def main() -> None:
         contrasts = drawn[name]
         values = tuple(contrasts.tolist())
         response: Response = MtfTable(tuple(FREQUENCIES.tolist()), values, values)
+        about = Stated(response, "stated", name)
         table = bd.evaluate(
             methods=arguments.methods,
             images=arguments.images,
-            sensor=sensor.with_fields(response=response, **axes_of(response, "stated", name)),
+            sensor=sensor.with_fields(response=response, **axes_of(response, about, about)),
         )
         for row in table.rows:
             # The published rows of the paper lack this figure.

@@ -176,13 +176,15 @@ def _sensor_rows(sensor: Sensor) -> list[Row]:
         if table != "mtf" or response is None:
             continue
         # The MTF is a measured table, or follows from parts of a point-spread function.
+        across, along = sensor.contrasts
         texts = {"psf": str(response)}
         if isinstance(response, MtfTable):
             columns = ("frequency", "across", "along")
             texts = {key: ", ".join(f"{v:g}" for v in getattr(response, key)) for key in columns}
-        words = {"status": sensor.mtf_nyquist.status, "source": sensor.mtf_nyquist.source}
         for key, text in texts.items():
-            rows.append(Row("constants", f"mtf.{key}", {}, {"value": text, **words}))
+            about = along if key == "along" else across
+            words = {"value": text, "status": about.status, "source": about.source}
+            rows.append(Row("constants", f"mtf.{key}", {}, words))
     return rows + _table_rows(sensor.effects)
 
 

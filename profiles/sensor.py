@@ -134,7 +134,7 @@ class Sensor:
         """Raise ValueError if the response contradicts the contrasts, or if they exceed the
         anti-alias filter.
         """
-        axes = [self.mtf_nyquist, self.mtf_nyquist_along or self.mtf_nyquist]
+        axes = self.contrasts
         if self.response and not np.allclose([c.low for c in axes], self.response.at_nyquist):
             raise ValueError(
                 f"mtf has the contrasts {axes[0]} and {axes[1]} at Nyquist, but the "
@@ -204,25 +204,28 @@ class Sensor:
             if constant := getattr(self, key):
                 tables[table][key] = constant
         if isinstance(self.response, MtfTable):
-            axes = {
-                axis: self._stated(getattr(self.response, axis)) for axis in ("across", "along")
+            curve = self.response
+            tables["mtf"] = {
+                "frequency": curve.frequency,
+                "across": _stated(curve.across, self.contrasts[0]),
+                "along": _stated(curve.along, self.contrasts[1]),
             }
-            tables["mtf"] = {"frequency": self.response.frequency, **axes}
         elif self.response:
             samples = path.with_name(f"{path.stem}-psf.npy")
             point = self.response
             np.save(samples, unpacked(point).astype(np.float32))
             tables["mtf"] = {
-                "psf": self._stated(samples.name),
+                "psf": _stated(samples.name, self.mtf_nyquist),
                 "psf_samples_per_px": point.samples_per_px,
             }
         text = sensor_toml(self.description, {**tables, **self.effects})
         path.write_text(text, encoding="utf-8")
         return path
 
-    def _stated(self, value: object) -> Stated:
-        """Return a part of the response with the provenance of its contrasts."""
-        return Stated(value, self.mtf_nyquist.status, self.mtf_nyquist.source)
+    @property
+    def contrasts(self) -> tuple[Constant, Constant]:
+        """The contrasts at the Nyquist frequency across the track and along it."""
+        return self.mtf_nyquist, self.mtf_nyquist_along or self.mtf_nyquist
 
     def replace(self, **numbers: float | tuple[float, float]) -> "Sensor":
         """Return this sensor with some numbers replaced, each by a value or a range (low, high).
@@ -408,6 +411,11 @@ class Sensor:
             f"alpha, beta >= 0), but it is {snr_0}. Correct one of the two; both are linear "
             "ratios, not dB."
         )
+
+
+def _stated(value: object, contrast: Constant) -> Stated:
+    """Return a part of the response with the provenance of its contrast."""
+    return Stated(value, contrast.status, contrast.source)
 
 
 SensorLike = Sensor | str | os.PathLike[str]

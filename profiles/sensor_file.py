@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from beers_deploy.profiles.constant import Constant, Limits, Stated, Status
+from beers_deploy.profiles.constant import Constant, Limits, Stated
 from beers_deploy.profiles.effects import TABLES as EFFECT_TABLES
 from beers_deploy.profiles.effects import effect_tables
 from beers_deploy.profiles.errors import ProfileError, printable
@@ -112,14 +112,13 @@ def sensor_fields(label: str, raw: Mapping[str, Any], folder: Path) -> dict[str,
     parts = validated(dict[str, Stated], blur, label, groups)
     values = {key: part.value for key, part in parts.items()}
     if "psf" in parts:
-        about = parts["psf"]
+        across = along = parts["psf"]
         response: Response = validated(PointSpreadFile, values, label, groups).read(label, folder)
     else:
-        # Both contrasts have one status, which an axis that was not measured decides.
-        axes = [parts["across"], parts.get("along", parts["across"])]
-        about = next((axis for axis in axes if axis.status == "assumed"), axes[0])
+        across = parts["across"]
+        along = parts.get("along", across)
         response = validated(MtfTable, {"along": values["across"], **values}, label, groups)
-    return {**fields, "response": response, **axes_of(response, about.status, about.source)}
+    return {**fields, "response": response, **axes_of(response, across, along)}
 
 
 def _content(where: str, table: str, raw: object) -> Mapping[str, Any]:
@@ -143,18 +142,20 @@ def _content(where: str, table: str, raw: object) -> Mapping[str, Any]:
     return raw
 
 
-def axes_of(response: Response, status: Status, source: str) -> dict[str, Constant | None]:
+def axes_of(response: Response, *parts: Stated) -> dict[str, Constant | None]:
     """Return the two fields of a `Sensor` that state the contrast at Nyquist, computed from a
     complete blur.
 
-    The contrast along the track is None if it equals that across it.
+    The contrast along the track is None if it equals that across it, and has the same source.
 
     Args:
         response: the table or the point-spread function.
-        status: the status of the contrasts, which is that of the response.
-        source: the source of the response.
+        parts: the parts across and along the track, for their status and source.
     """
-    across, along = (Constant(value, status, source) for value in response.at_nyquist)
+    across, along = (
+        Constant(value, part.status, part.source)
+        for value, part in zip(response.at_nyquist, parts, strict=True)
+    )
     return {"mtf_nyquist": across, "mtf_nyquist_along": along if along != across else None}
 
 

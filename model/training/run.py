@@ -214,7 +214,8 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
         nominal = degraded.nominal()
         mirrors, alike = nominal.symmetry
         # Axes that are drawn from two ranges differ, even where the middles of the ranges agree.
-        turns = alike and degraded.mtf_nyquist_along is None
+        ranges = degraded.mtf_nyquist_along is not None and degraded.response is None
+        turns = alike and not ranges
         source = StoredPairs(
             files,
             run.patches.patch_px,

@@ -18,6 +18,7 @@ from beers_deploy.profiles.response import MtfTable, PointSpread, centroid, pack
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_numbers import same_instrument
 from beers_deploy.profiles.validation import validated
+from beers_deploy.shipped_tables import table_of_profile
 from tests.profiles.own_sensor import SHIPPED, own_sensor
 from tests.profiles.test_profile_files import refusal
 
@@ -64,6 +65,19 @@ def test_a_table_returns_its_own_values(tmp_path: Path) -> None:
     one_axis = Sensor.load(sensor_file(tmp_path, TABLE.rsplit("\n", 1)[0]))
     assert one_axis.mtf_nyquist_along is None
     assert one_axis.nominal().mtf_axes == pytest.approx((0.12, 0.12))
+
+
+@pytest.mark.parametrize("along", [[1, 0.5, 0.12], [1, 0.4, 0.05]])
+def test_each_axis_of_a_table_keeps_its_own_source(along: list[float], tmp_path: Path) -> None:
+    mtf = f"""frequency = [0, 0.25, 0.5]
+across = {{value = [1, 0.5, 0.12], status = "measured", source = "a lab"}}
+along = {{value = {along}, status = "assumed", source = "no edge"}}"""
+    profile = Sensor.load(sensor_file(tmp_path, mtf))
+    for sensor in (profile, Sensor.load(profile.save(tmp_path / "saved.toml"))):
+        assert [axis.source for axis in sensor.contrasts] == ["a lab", "no edge"]
+        assert [axis.status for axis in sensor.contrasts] == ["measured", "assumed"]
+    texts = {row.name: row.text for row in table_of_profile(str(tmp_path / "saved.toml"))}
+    assert [texts[f"mtf.{axis}"]["source"] for axis in ("across", "along")] == ["a lab", "no edge"]
 
 
 @settings(max_examples=30)

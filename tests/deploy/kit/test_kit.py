@@ -29,6 +29,7 @@ from beers_deploy.model.exposure import choose_factors, exposures_for
 from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.self_check import SelfCheck
 from beers_deploy.model.variants import Variant
+from beers_deploy.profiles.constant import Stated
 from beers_deploy.profiles.errors import MachineError, OptionError, ProfileError
 from beers_deploy.profiles.response import MtfTable
 from beers_deploy.profiles.sensor_file import axes_of
@@ -240,7 +241,8 @@ def test_the_host_part_chooses_factors_and_corrects_as_the_library_does(
         np.float32
     )
     table = MtfTable((0.0, 0.25, 0.5), (1.0, 0.6, 0.1), (1.0, 0.6, 0.1))
-    departing = sensor.with_fields(response=table, **axes_of(table, "stated", "for a test"))
+    about = Stated(table, "stated", "for a test")
+    departing = sensor.with_fields(response=table, **axes_of(table, about, about))
     for profile in (sensor, departing):
         host["S"]["consistency"] = consistency_facts(bd.Network.load(NAME), profile)
         step = Consistency.of(profile.nominal(), profile.reference.nominal(), full_scale=1.0)

@@ -21,6 +21,7 @@ from beers_deploy.performance import traditional
 from beers_deploy.performance.board import Bench, Question, bench_board, boards_for
 from beers_deploy.performance.swath import Swath
 from beers_deploy.performance.tables import sweep_rows, within_words
+from beers_deploy.profiles.constant import Stated
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.response import MtfTable
@@ -197,7 +198,8 @@ def test_a_curve_of_another_shape_takes_the_host_longer(network: Path) -> None:
     """Where the MTF departs from the formula's curve the consistency step corrects detail too."""
     table = MtfTable((0.0, 0.25, 0.5), (1.0, 0.6, 0.1), (1.0, 0.6, 0.1))
     sensor = Sensor.load("pleiades-degraded")
-    departing = sensor.with_fields(response=table, **axes_of(table, "stated", "for a test"))
+    about = Stated(table, "stated", "for a test")
+    departing = sensor.with_fields(response=table, **axes_of(table, about, about))
     boards, _ = boards_for(boards_of("vck190"), None, None)
     question = Question(boards, [], (700, 600), [128], "exact", None, None, consistency=True)
     times = []

@@ -123,7 +123,8 @@ def test_a_box_gives_one_axis_for_both(raw: tuple[Path, Path], tmp_path: Path) -
     assert "no curve along the track" in table["along"]["source"]
     assert (table["across"]["status"], table["along"]["status"]) == ("measured", "assumed")
     (tmp_path / "mine.toml").write_text(profile_toml(result), encoding="utf-8")
-    assert Sensor.load(tmp_path / "mine.toml").mtf_nyquist.status == "assumed"
+    axes = Sensor.load(tmp_path / "mine.toml").contrasts
+    assert [axis.status for axis in axes] == ["measured", "assumed"]
     assert result.rows()[0].figures["MTF along at Nyquist"].mode == "unavailable"
 
 
