@@ -41,7 +41,8 @@ WORTH_A_WORD_DB = 0.002
 """Smaller gains are not mentioned unless they are significant."""
 
 CONSTRAINT = re.compile(
-    r"(?P<name>[a-z0-9-]+)\s*(?P<side><=|>=)\s*(?P<limit>[+-]?\d+(\.\d+)?([eE][+-]?\d+)?)\s*(?P<unit>\S*)"
+    r"(?P<name>[a-z0-9-]+)\s*(?P<side><=|>=)\s*(?P<limit>[+-]?\d+(\.\d+)?(e[+-]?\d+)?)\s*(?P<unit>\S*)",
+    re.IGNORECASE,
 )
 
 
@@ -99,20 +100,21 @@ def parse_constraints(option: str, text: str | None) -> list[Constraint]:
     """
     limits = []
     for part in map(str.strip, [] if text is None else text.split(",")):
-        fields = CONSTRAINT.fullmatch(part.lower())
+        fields = CONSTRAINT.fullmatch(part)
         if fields is None or not math.isfinite(float(fields["limit"])):
             raise OptionError(
                 f"`{option}` must be NAME<=NUMBER or NAME>=NUMBER, such as 'latency<=20s' or "
                 f"'psnr>=44', but it is {printable(repr(part))}."
             )
         name, side, number, written_unit = fields.group("name", "side", "limit", "unit")
+        name = name.lower()
         if name not in NAMES:
             raise OptionError(
                 f"`{option}` must name one of {', '.join(NAMES)}, but it names "
                 f"{printable(repr(name))}."
             )
         key, unit = NAMES[name]
-        if written_unit not in ("", unit.lower()):
+        if written_unit.lower() not in ("", unit.lower()):
             raise OptionError(
                 f"`{option}` must give {key} in {unit}, but its unit is "
                 f"{printable(repr(written_unit))}. Convert the number to {unit}."

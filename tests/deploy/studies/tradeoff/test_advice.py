@@ -151,6 +151,7 @@ def test_every_figure_can_be_limited_in_its_unit(name: str) -> None:
         ("latency<=1e999", "NAME<=NUMBER"),
         ("speed<=3", "one of psnr"),
         ("latency<=20ms", "in s, but its unit is 'ms'. Convert the number"),
+        ("power>=20W", "Write power<=20W."),
         ("psnr>=44,", "NAME<=NUMBER"),
         ("latency<=-5s", "above 0, but it is board latency <= -5 s"),
         ("host<=0", "above 0, but it is host p50 <= 0 s/Mpx"),
