@@ -41,7 +41,7 @@ class Entry:
         configuration: the name of the DPU's configuration; the board's default if None.
         target: the name of the board, if it is another one with the same DPU.
         provider: the execution provider of onnxruntime that ran the network.
-        power_w: the measured power in W. It is not used, because runs correct only rates.
+        power_w: the measured power in W. It is shown next to the rate, and corrects nothing.
     """
 
     model: str
@@ -65,12 +65,14 @@ class Run:
         placement: where each operation of the network runs.
         fps: the measured rate in frames per second.
         predicted: the prediction without any correction by measurements.
+        power_w: the measured power in W, if it is known.
     """
 
     name: str
     placement: Placement
     fps: float
     predicted: Prediction
+    power_w: float | None
 
     @property
     def ratio(self) -> tuple[Levels, float]:
@@ -100,8 +102,8 @@ class OwnRuns:
         """Compare each measured rate with its prediction, to show what the runs improve.
 
         Returns:
-            A row for each run with the measured rate, the prediction without any run, the
-            prediction corrected by all other runs, and the error of both in percent.
+            A row for each run with the measured rate and power, the prediction without any run,
+            the prediction corrected by all other runs, and the error of both in percent.
         """
         rows = []
         for run in self.runs:
@@ -115,6 +117,8 @@ class OwnRuns:
                     prediction.fps, "frame/s", prediction.fps_interval, f"cost model, {key}"
                 )
                 figures[f"{key} is off by"] = predicted(off, "%", (off, off), "arithmetic")
+            if run.power_w is not None:
+                figures["power"] = published(run.power_w, "W", self.source)
             name = f"{run.name}, {before.dpu.target.name} {before.dpu.name}"
             rows.append(Row("runs", name, figures, {"bound": before.bound}))
         return rows
@@ -175,4 +179,5 @@ def _run(entry: Entry, path: Path, where: str, board: Dpu) -> Run:
             f"{where} has {entry.fps:g} frames per second, but {prediction.fps:.3g} are predicted, "
             "which is too far away to be the same network. Correct fps or model."
         )
-    return Run(f"{model.stem}, tiles of {entry.tile_px}", placement, entry.fps, prediction)
+    name = f"{model.stem}, tiles of {entry.tile_px}"
+    return Run(name, placement, entry.fps, prediction, entry.power_w)

@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -36,7 +37,7 @@ def rate(folder: Path, name: str, dpu: Dpu = DPU, tile_px: int = 320) -> Predict
     return predict_network(folder / f"{name}.onnx", dpu, tile_px)
 
 
-def runs_of(folder: Path, factor: float, *more: dict[str, str], name: str = "deep") -> OwnRuns:
+def runs_of(folder: Path, factor: float, *more: dict[str, Any], name: str = "deep") -> OwnRuns:
     """Return runs of a network that are `factor` times as fast as predicted, one for each
     `more`.
     """
@@ -96,7 +97,10 @@ def test_repeated_runs_correct_further_but_not_beyond_their_own_rate(count: int)
 
 
 def test_each_run_is_compared_with_its_prediction_from_the_others(folder: Path) -> None:
-    first, second = runs_of(folder, 0.5, {}, {"configuration": "C32B6"}).run_rows()
+    more = {"configuration": "C32B6", "power_w": 20}
+    first, second = runs_of(folder, 0.5, {}, more).run_rows()
+    assert second.figures["power"].value == 20
+    assert "power" not in first.figures
     for row in (first, second):
         before, after = (
             abs(row.figures[f"{key} is off by"].value or 0)
