@@ -31,7 +31,7 @@ from beers_deploy.quant.gate import GateResult, compare, gate_row
 from beers_deploy.quant.integer.agreement import integer_rows
 from beers_deploy.quant.onnx_file import faults_named, load_onnx, metadata, require_quantized
 from beers_deploy.quant.passes.effort import Effort
-from beers_deploy.quant.passes.selection import ALL, Passes
+from beers_deploy.quant.passes.selection import ALL
 from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.samples.own import OwnSamples
 from beers_deploy.quant.sensitivity import (
@@ -307,7 +307,6 @@ def family_model(
     images: Sequence[Path] = (),
     seed: int = 0,
     shifts: Shifts = SHIFTS,
-    passes: Passes = ALL,
     effort: Effort = Effort.normal,
 ) -> onnx.ModelProto:
     """Quantise a sensor-conditioned network with one calibration for the whole family of sensors.
@@ -320,7 +319,6 @@ def family_model(
             empty, only scenes drawn at random are used.
         seed: the seed of the patches.
         shifts: the bit shifts that the target's arithmetic allows.
-        passes: the passes that reduce the rounding error; by default all of them.
         effort: the effort of the search for equalisation factors.
 
     Returns:
@@ -342,7 +340,7 @@ def family_model(
     with progress(f"calibrating {network.name} over the family of sensors"):
         patches = bank_images(scenes, scale, seed, weights.kernels)
         middle = bank_of_vector((0.0,) * len(RANGES), weights.kernels)
-        quantized = quantize_behind_bank(weights, middle, patches, shifts, passes, effort)
+        quantized = quantize_behind_bank(weights, middle, patches, shifts, ALL, effort)
     description = {
         "variant": network.name,
         "reference": REFERENCE,

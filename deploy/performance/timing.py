@@ -13,26 +13,26 @@ import psutil
 from beers_deploy.profiles.figures import Figure, measured, unavailable
 
 POWERCAP = Path("/sys/class/powercap")
+"""The folder of the energy counters (RAPL) of Linux."""
 
 Result = TypeVar("Result")
 
 
-def timed(work: Callable[[], Result], powercap: Path = POWERCAP) -> tuple[Result, float, Figure]:
+def timed(work: Callable[[], Result]) -> tuple[Result, float, Figure]:
     """Run some work once, and measure its wall time and the mean power of the processor.
 
     Args:
         work: the function to run.
-        powercap: the folder of the energy counters (RAPL) of Linux.
 
     Returns:
         The result of `work`, its wall time in s, and the power in W of all processor packages,
         unavailable if there are no counters.
     """
-    before = _read(powercap)
+    before = _counters_uj()
     start = time.perf_counter()
     result = work()
     elapsed_s = time.perf_counter() - start
-    after = _read(powercap)
+    after = _counters_uj()
     if isinstance(before, str):
         return result, elapsed_s, unavailable("W", before)
     if isinstance(after, str):
@@ -47,12 +47,12 @@ def timed(work: Callable[[], Result], powercap: Path = POWERCAP) -> tuple[Result
     return result, elapsed_s, measured(energy_uj / 1e6 / elapsed_s, "W", source)
 
 
-def _read(powercap: Path) -> dict[Path, int] | str:
+def _counters_uj() -> dict[Path, int] | str:
     """Read the counters of the packages in microjoules, or return the reason why there are none."""
     try:
         counters = {
             domain: int((domain / "energy_uj").read_text(encoding="utf-8"))
-            for domain in powercap.glob("*rapl*:*")
+            for domain in POWERCAP.glob("*rapl*:*")
             if (domain / "name").read_text(encoding="utf-8").startswith("package")
         }
     except (OSError, ValueError) as error:

@@ -271,7 +271,7 @@ def _detection(
     if isinstance(sensor, str):
         # A sensor that is named twice is compared once.
         named = list(dict.fromkeys(name.strip() for name in sensor.split(",")))
-    network = open_detector(detector, size_px=side_px)
+    network = open_detector(detector, side_px)
     scenes, notes = labelled_scenes(
         network.names,
         {} if classes is None else parse_classes(classes),

@@ -106,7 +106,6 @@ def simulate_pair(
     reference: Instrument,
     oversampling: int,
     draw: Draw,
-    margin_px: int = MARGIN_PX,
 ) -> Pair:
     """Simulate two acquisitions of a scene (..., H, W) in W/m2/sr/um, each with its own noise.
 
@@ -116,15 +115,14 @@ def simulate_pair(
         reference: the sensor of the second image.
         oversampling: r, the number of scene pixels per pixel of the sensors, along each side.
         draw: seed and patch number of the random effects.
-        margin_px: the number of pixels of the image that are cropped on each side.
 
     Returns:
-        The pair, each (..., H / r - 2 margin, W / r - 2 margin).
+        The pair, each (..., H / r - 2 MARGIN_PX, W / r - 2 MARGIN_PX).
     """
     scene = prepare_scene(radiance, oversampling)
     return Pair(
-        acquire(scene, degraded, draw, margin_px=margin_px),
-        acquire(scene, reference, draw, "reference", margin_px=margin_px),
+        acquire(scene, degraded, draw),
+        acquire(scene, reference, draw, "reference"),
     )
 
 

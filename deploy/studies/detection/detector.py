@@ -133,12 +133,11 @@ class Detector:
         return Boxes.of(rows[:, :4], rows[:, 5], rows[:, 4])
 
 
-def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> Detector:
+def open_detector(path: Path, size_px: int | None = None) -> Detector:
     """Open the file of an object detector.
 
     Args:
         path: an ONNX file that Ultralytics exported for detection.
-        threads: the number of threads of onnxruntime; 0 uses one for each core.
         size_px: the side of the square input in pixels; None uses the size that the file is fixed
             to or was trained for.
 
@@ -175,7 +174,7 @@ def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> D
             f"or end2end), but it has {printable(facts)}. {REMEDY}"
         )
     size = _size_px(fixed_tile_px(model), about.get("imgsz"), size_px, path)
-    return Detector(names, size, _flag(model), partial(_answer, open_session(model, threads), path))
+    return Detector(names, size, _flag(model), partial(_answer, open_session(model), path))
 
 
 def _answer(session: InferenceSession, path: Path, image: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from beers_deploy.performance import timing
 from beers_deploy.performance.timing import interleaved, load_of_others, timed
 from beers_deploy.profiles.figures import measured
 
@@ -29,10 +30,11 @@ def counter(root: Path, energy_uj: int, name: str = "package-0") -> Path:
     ("before", "after", "joules"), [(200_000, 700_000, 0.5), (900_000, 100_000, 0.2)]
 )
 def test_power_is_energy_over_time_also_of_a_counter_that_starts_again(
-    before: int, after: int, joules: float, tmp_path: Path
+    before: int, after: int, joules: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(timing, "POWERCAP", tmp_path)
     energy = counter(tmp_path, before)
-    _, elapsed_s, power = timed(lambda: energy.write_text(str(after)), tmp_path)
+    _, elapsed_s, power = timed(lambda: energy.write_text(str(after)))
     assert power.mode == "measured"
     assert power.value == pytest.approx(joules / elapsed_s)
 
@@ -43,11 +45,12 @@ def test_power_is_energy_over_time_also_of_a_counter_that_starts_again(
     [("", "", "no RAPL"), ("dram", "5", "no RAPL"), ("package-0", "?", "cannot be read")],
 )
 def test_without_counters_of_the_package_power_is_unavailable_with_a_reason(
-    name: str, text: str, reason: str, tmp_path: Path
+    name: str, text: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(timing, "POWERCAP", tmp_path)
     if name:
         counter(tmp_path, 5, name).write_text(text)
-    result, elapsed_s, power = timed(lambda: 7, tmp_path)
+    result, elapsed_s, power = timed(lambda: 7)
     assert (result, power.mode, power.value) == (7, "unavailable", None)
     assert elapsed_s > 0
     assert reason in power.reason

@@ -76,8 +76,9 @@ def test_the_margin_keeps_the_wrapped_border_out() -> None:
     strip[:, :5] = 400.0
 
     def leak(margin_px: int) -> float:
-        pair = (simulate_pair(s, QUIET, QUIET, 5, Draw(0), margin_px) for s in (dark, strip))
-        before, after = (one.degraded[:, -1].mean() for one in pair)
+        scenes = (prepare_scene(scene, 5) for scene in (dark, strip))
+        images = (acquire(scene, QUIET, Draw(0), margin_px=margin_px) for scene in scenes)
+        before, after = (image[:, -1].mean() for image in images)
         return abs(float(after - before))
 
     assert leak(MARGIN_PX) < 5

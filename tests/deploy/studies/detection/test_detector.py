@@ -19,7 +19,7 @@ ONE = raw((1, 1, 1, 1, 0.5, 0))
 
 def test_the_raw_layout_gives_the_boxes_of_every_class_that_scores(tmp_path: Path) -> None:
     answer = raw((20, 30, 10, 8, 0.9, 0.2), (21, 30, 10, 8, 0.8, 0.0), (50, 40, 6, 6, 0.0, 0.0005))
-    boxes = open_detector(detector(tmp_path / "a.onnx", answer), 1).detect(IMAGE)
+    boxes = open_detector(detector(tmp_path / "a.onnx", answer)).detect(IMAGE)
     assert boxes.corners.tolist() == [[15, 10, 25, 18], [15, 10, 25, 18]]
     assert boxes.classes.tolist() == [0, 1]
     assert not boxes.ignored.any()
@@ -28,7 +28,7 @@ def test_the_raw_layout_gives_the_boxes_of_every_class_that_scores(tmp_path: Pat
 
 def test_the_final_layout_gives_its_rows_and_not_its_padding(tmp_path: Path) -> None:
     answer = final((15, 26, 25, 34, 0.2, 1), (15, 26, 25, 34, 0.9, 0), (16, 26, 26, 34, 0.6, 0))
-    net = open_detector(detector(tmp_path / "a.onnx", answer, end2end=True), 1)
+    net = open_detector(detector(tmp_path / "a.onnx", answer, end2end=True))
     boxes = net.detect(IMAGE)
     assert boxes.corners.tolist() == [[15, 10, 25, 18], [16, 10, 26, 18], [15, 10, 25, 18]]
     assert boxes.classes.tolist() == [0, 0, 1]
@@ -37,25 +37,25 @@ def test_the_final_layout_gives_its_rows_and_not_its_padding(tmp_path: Path) -> 
 
 def test_suppression_inside_the_file_is_flagged_with_its_confidence(tmp_path: Path) -> None:
     answer = final((15, 26, 25, 34, 0.9, 0))
-    flagged = open_detector(detector(tmp_path / "a.onnx", answer, cut=0.25, args={"nms": True}), 1)
+    flagged = open_detector(detector(tmp_path / "a.onnx", answer, cut=0.25, args={"nms": True}))
     assert "drops what lies below confidence 0.25" in flagged.flag
     assert len(flagged.detect(IMAGE)) == 1
-    low = open_detector(detector(tmp_path / "b.onnx", answer, cut=0.001, args={"nms": True}), 1)
+    low = open_detector(detector(tmp_path / "b.onnx", answer, cut=0.001, args={"nms": True}))
     assert low.flag == ""
 
 
 def test_the_size_is_the_file_s_or_the_one_asked_for(tmp_path: Path) -> None:
     fixed = detector(tmp_path / "a.onnx", ONE)
     free = detector(tmp_path / "b.onnx", ONE, size_px="side")
-    assert [open_detector(fixed, 1, side).size_px for side in (None, 64)] == [64, 64]
-    assert [open_detector(free, 1, side).size_px for side in (None, 128)] == [64, 128]
+    assert [open_detector(fixed, side).size_px for side in (None, 64)] == [64, 64]
+    assert [open_detector(free, side).size_px for side in (None, 128)] == [64, 128]
     with pytest.raises(OptionError, match=r"`side` must be 64 px, .*a.onnx .* 128 px"):
-        open_detector(fixed, 1, 128)
+        open_detector(fixed, 128)
     sizes: list[object] = [None, [64, 96], [[], []], "wide"]
     for size in sizes:
         unsaid = detector(tmp_path / "c.onnx", ONE, size_px="side", imgsz=size)
         with pytest.raises(OptionError, match=r"a number of px, but c.onnx states .* Give `side`"):
-            open_detector(unsaid, 1)
+            open_detector(unsaid)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_another_layout_is_refused_with_the_values_that_were_read(
     answer: np.ndarray, options: dict[str, Any], sentence: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ModelError, match=sentence):
-        open_detector(detector(tmp_path / "a.onnx", answer, **options), 1)
+        open_detector(detector(tmp_path / "a.onnx", answer, **options))
 
 
 INVALID = [
@@ -96,7 +96,7 @@ def test_an_answer_that_is_no_detection_is_refused(
     answer: np.ndarray, sentence: str, tmp_path: Path
 ) -> None:
     layout = final() if answer.shape[-1:] == (6,) else raw()
-    net = open_detector(detector(tmp_path / "a.onnx", layout), 1)
+    net = open_detector(detector(tmp_path / "a.onnx", layout))
     with pytest.raises(ModelError, match=sentence):
         net.decoded(answer)
 
@@ -104,7 +104,7 @@ def test_an_answer_that_is_no_detection_is_refused(
 def test_at_most_300_boxes_are_returned(tmp_path: Path) -> None:
     """The final layout is cut to 300. In the raw layout, suppression keeps at most 300 itself."""
     many = final(*[(1, 1, 2, 2, 0.5, 0)] * 400, count=400)
-    assert len(open_detector(detector(tmp_path / "b.onnx", many), 1).decoded(many)) == 300
+    assert len(open_detector(detector(tmp_path / "b.onnx", many)).decoded(many)) == 300
 
 
 def test_a_class_is_matched_by_its_letters_or_by_the_users_mapping() -> None:
