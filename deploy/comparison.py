@@ -291,21 +291,25 @@ def pair_of(
     return floating.with_output(output), int8.with_output(its_output)
 
 
+def stands_for_pair(network: NetworkLike | None) -> bool:
+    """Return True if a network stands for a float and an INT8 network: the `Network` that
+    `quantize` returned, the name of a shipped one, or None for the default.
+    """
+    if isinstance(network, Network):
+        return network.origin is not None
+    if isinstance(network, str | os.PathLike):
+        return not (Path(network).suffix or Path(network).exists())
+    return network is None
+
+
 def _shipped_int8(network: NetworkLike | None) -> str:
     """Return the name of the INT8 network of a shipped pair, given the name of either network."""
-    if network is None:
-        return f"{VARIANT}{INT8}"
-    label = type(network).__name__
-    if isinstance(network, str | os.PathLike):
-        path = Path(network)
-        label = path.name
-        if not (path.suffix or path.exists()):
-            name = str(path).removesuffix(INT8)
-            shipped_weights(name)
-            return f"{name}{INT8}"
-    elif isinstance(network, Network):
-        label = network.name
-    raise OptionError(
-        f"The INT8 network of {label} is missing. Give it as `int8_network`, or give the name of "
-        "a shipped pair."
-    )
+    if not stands_for_pair(network):
+        label = getattr(network, "name", type(network).__name__)
+        raise OptionError(
+            f"The INT8 network of {network if isinstance(network, str) else label} is missing. "
+            "Give it as `int8_network`, or give the name of a shipped pair."
+        )
+    name = VARIANT if network is None else str(network).removesuffix(INT8)
+    shipped_weights(name)
+    return f"{name}{INT8}"

@@ -1,10 +1,8 @@
 """The networks under test, opened once."""
 
 import math
-import os
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from pathlib import Path
 
 import numpy as np
 import onnxruntime as ort
@@ -12,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, pixel_shuffle, pixel_unshuffle
 
-from beers_deploy.comparison import pair_of
+from beers_deploy.comparison import pair_of, stands_for_pair
 from beers_deploy.conditioned_file import conditioned_on
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike
@@ -172,7 +170,7 @@ def open_subject(
             values than [0, 1], or the float and the INT8 network are swapped.
     """
     profile = Sensor.load(sensor)
-    if int8_network is not None or _is_pair(float_network):
+    if int8_network is not None or stands_for_pair(float_network):
         floating, int8 = pair_of(float_network, int8_network, profile)
         # A file for every sensor is tested under the sensor that the float network has.
         if floating.profile is not None:
@@ -196,15 +194,6 @@ def open_subject(
                 "but stress tests are for networks that read images in [0, 1]."
             )
     return subject
-
-
-def _is_pair(network: NetworkLike | None) -> bool:
-    """Return True if a network stands for a pair: the default one, a shipped name, or an origin."""
-    if isinstance(network, Network):
-        return network.origin is not None
-    if isinstance(network, str | os.PathLike):
-        return not (Path(network).suffix or Path(network).exists())
-    return network is None
 
 
 def in_torch(graph: Graph, image: Tensor) -> Tensor:
