@@ -82,7 +82,8 @@ def evaluate(
         out: folder for report.html and pictures.
         calibrate: copy of the network's file to write, with the interval of 'restore --interval'
             fitted on these pairs; `methods` must be that file alone.
-        sweep: also compare under 16 sensors that are known exactly, and 7 that are known wrongly.
+        sweep: also compare with the traditional pipeline, which takes most of the time, under 16
+            sensors known exactly, and 7 known wrongly.
         brightness: also compare with the radiance of the scenes times these factors, such as
             0.25,0.05.
         bits_per_pixel: also compare restoration before and after JPEG 2000 compresses to this
