@@ -71,7 +71,7 @@ def demo(
 
     folder = Path(out)
     path = path_or_none(image)
-    with steps("demo:", STEPS) as bar:
+    with steps("demo", STEPS) as bar:
         bar.advance(0, "reading the image")
         sensors = parts.load_sensors(sensor)
         degraded, pair = parts.read_input(path, seed, sensors, full_scale)

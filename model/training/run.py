@@ -288,11 +288,13 @@ def _train(run: Run, trainer: Trainer, batches: Batches, validation: Validation)
             write_picture(validation, network, run.out / "validation.png")
 
         every = run.validate_steps if validation.pairs else 0
-        trainer.run(
-            batches,
-            run.checkpoint,
-            Schedule(validate_steps=every, report=report, validate=validate),
-        )
+        schedule = Schedule(validate_steps=every, report=report, validate=validate)
+        try:
+            trainer.run(batches, run.checkpoint, schedule)
+        except KeyboardInterrupt:
+            words = "stopped at step %d of %d; run it again with `resume` to go on"
+            logger.warning(words, trainer.step, run.recipe.steps)
+            raise
 
 
 class Log:
