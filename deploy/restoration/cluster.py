@@ -137,6 +137,8 @@ def _cluster_error(fault: str, remedy: str) -> MachineError:
 
 def _connect(distributed: Any, address: str) -> Any:
     try:
+        # A client that has no valid address waits for 20 s when it is deleted, and fails then.
+        distributed.comm.resolve_address(address)
         client = distributed.Client(address, timeout=ANSWER_S, set_as_default=False)
     except (OSError, ValueError) as error:
         reason = reason_of(error)
