@@ -73,6 +73,8 @@ def list_images(folder: Path) -> list[Path]:
     images = sorted(path for path in folder.glob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
     if not images:
         fault = "there is no image in it" if folder.is_dir() else "no such folder"
+        if folder.is_file():
+            fault = "it is a file"
         raise ImageError(
             f"{folder} is not a folder of images: {fault}. Give TIFF, PNG or JPEG files."
         )
