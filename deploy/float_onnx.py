@@ -59,7 +59,7 @@ def to_onnx(
         OptionError: the network cannot move the pixels of such a tile into channels.
     """
     scale = network.variant.scale
-    require_tile(tile_px, scale)
+    tile_px = require_tile(tile_px, scale)
     writer = GraphWriter()
     arrays = network.tensors if isinstance(network, Weights) else network.state_dict()
     for name, value in arrays.items():
@@ -94,7 +94,7 @@ def banked_to_onnx(
     bank = network_bank(sensor, weights.kernels)
     scale = variant.scale
     pixels = variant.pixels
-    require_tile(tile_px, scale)
+    tile_px = require_tile(tile_px, scale)
     vector = np.array(sensor_vector(sensor).values, np.float32)
     tensors = dict(weights.tensors)
     # The head does not read the analytic restoration, hence weights of 0 for its planes.
@@ -165,19 +165,23 @@ def _ended(
     return make_model(graph, {"beers_deploy_version": __version__, "precision": "float32", **about})
 
 
-def require_tile(tile_px: int | None, scale: int) -> None:
-    """Raise OptionError if a tile does not consist of whole squares of pixels.
+def require_tile(tile_px: int | None, scale: int) -> int | None:
+    """Return the side of a tile, or raise OptionError if it is not made of whole squares of pixels.
 
     Args:
         tile_px: side of the tile in pixels; None for any size, which passes.
         scale: side of the squares that the network moves into channels, so that its layers have
             1 / `scale` of the resolution.
     """
-    if tile_px is not None and tile_px % scale:
+    if tile_px is None:
+        return None
+    if not isinstance(tile_px, int | np.integer) or tile_px < 1 or tile_px % scale:
         raise OptionError(
-            f"`tile` must be a multiple of {scale} px, but it is {tile_px} px. Choose another "
+            f"`tile` must be a multiple of {scale} px, but it is {tile_px!r} px. Choose another "
             "`tile`, or leave it out."
         )
+    # ONNX accepts no integer of NumPy as a size.
+    return int(tile_px)
 
 
 def _conv(writer: GraphWriter, name: str, source: str) -> str:

@@ -24,7 +24,7 @@ from beers_deploy.network_files import (
     require_known,
     warn_outside,
 )
-from beers_deploy.profiles.errors import ModelError, optional, reason_of
+from beers_deploy.profiles.errors import ModelError, as_path, optional, reason_of, require_numbers
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.shipped import BLIND, DEFAULT_TARGET
@@ -216,8 +216,9 @@ class Network:
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the network as an ONNX file, atomically, and return the path of the file."""
-        save_onnx(self.model, Path(path))
-        return Path(path)
+        file = as_path(path)
+        save_onnx(self.model, file)
+        return file
 
     def core(
         self, board: TargetProfile | str = DEFAULT_TARGET, tile: int | None = None
@@ -241,8 +242,8 @@ class Network:
                 multiple of the squares of pixels that the network moves into channels.
         """
         core = read_core(self.model)
-        side_px = tile or fixed_tile_px(self.model)
-        require_tile(side_px, core.host_part.place_px)
+        side_px = fixed_tile_px(self.model) if tile is None else tile
+        side_px = require_tile(side_px, core.host_part.place_px)
         write = vint8_model if TargetProfile.load(board).npu else board_model
         return Network(write(core, metadata(self.model), side_px), f"{self.name}-core")
 
@@ -252,6 +253,7 @@ class Network:
         Values are float32 in the range that the network was trained on: [0, 1] of full scale for
         the shipped networks.
         """
+        require_numbers("images", images)
         return result_of(self._session, np.ascontiguousarray(images, np.float32))
 
     @cached_property

@@ -132,7 +132,7 @@ def export_int8(
     require_undamaged(model, "the network")
     core = read_core(model)
     side_px = tile or fixed_tile_px(model)
-    require_tile(side_px, core.host_part.place_px)
+    side_px = require_tile(side_px, core.host_part.place_px)
     for_board = Network(model, out.stem).core(target, tile) if core_file else None
     host = host_model(core, metadata(model), side_px)
     if c_file is not None:

@@ -15,7 +15,7 @@ from beers_deploy.model.io.files import write_text
 from beers_deploy.model.io.pictures import picture_url, stretch_of
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.model.raster.writer import write_tiff
-from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.errors import ImageError, as_path
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.reference import require_same_units
 from beers_deploy.profiles.sensor import Sensor
@@ -102,7 +102,7 @@ class Pair:
         Returns:
             The folder.
         """
-        out = Path(folder)
+        out = as_path(folder)
         for role, image in (("degraded", self.degraded), ("reference", self.reference)):
             write_tiff(out / role / "0000-drawn.tif", image)
         degraded, reference = map(asdict, self.profiles)

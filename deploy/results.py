@@ -18,7 +18,7 @@ from rich.console import Console
 from beers_deploy import __version__
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.processor import decided, processor_name
-from beers_deploy.profiles.errors import OptionError, encodable, one_line, printable
+from beers_deploy.profiles.errors import OptionError, as_path, encodable, one_line, printable
 from beers_deploy.profiles.figures import Check, Row, by_table
 from beers_deploy.tables.columns import LEGEND
 from beers_deploy.tables.frames import bars, tidy_frame, wide_frame
@@ -228,8 +228,9 @@ class Table:
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the document of `to_dict` as a JSON file, atomically, and return its path."""
-        write_text(Path(path), self.to_json())
-        return Path(path)
+        file = as_path(path)
+        write_text(file, self.to_json())
+        return file
 
     def to_markdown(self) -> str:
         """Render the title, the tables, checks, notes and the verdict as Markdown text."""

@@ -13,7 +13,9 @@ Each is also the built-in exception that a caller expects: ValueError, RuntimeEr
 A gate that fails is no error: its command exits with 1.
 """
 
+import os
 from importlib import import_module
+from pathlib import Path
 from traceback import walk_tb
 from typing import Any
 
@@ -123,6 +125,27 @@ class ModelError(BeersError, ValueError):
 
 class OptionError(BeersError, ValueError):
     """A value of a parameter that is out of range, or two that contradict each other."""
+
+
+def as_path(value: str | os.PathLike[str]) -> Path:
+    """Return the path of an output, or raise OptionError if the value is none."""
+    if not isinstance(value, str | os.PathLike):
+        raise OptionError(f"The output must be a path, got {printable(repr(value))}. Name it.")
+    return Path(value)
+
+
+def require_numbers(name: str, value: object) -> None:
+    """Raise ImageError if a text, a path or None is in the place of numbers.
+
+    Args:
+        name: the name of the parameter, for the message.
+        value: what was given; anything else is left to NumPy.
+    """
+    if value is None or isinstance(value, str | bytes | os.PathLike):
+        raise ImageError(
+            f"`{name}` must be numbers or an array, got {printable(repr(value))}. Read the file "
+            "first."
+        )
 
 
 class MachineError(BeersError, RuntimeError):

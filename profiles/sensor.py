@@ -16,7 +16,7 @@ from pydantic.dataclasses import dataclass
 
 from beers_deploy.profiles.constant import Constant, Limits, Stated
 from beers_deploy.profiles.effects import Effect, Effects, settled
-from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.errors import ProfileError, as_path, require_numbers
 from beers_deploy.profiles.instrument import (
     OFFSET,
     Instrument,
@@ -198,7 +198,7 @@ class Sensor:
         """Write the profile as a TOML file that `load` reads, with a point-spread function next to
         it as .npy.
         """
-        path = Path(path)
+        path = as_path(path)
         tables: dict[str, dict[str, object]] = {table: {} for table in TABLES}
         for key, table in TABLE_OF.items():
             if constant := getattr(self, key):
@@ -268,6 +268,7 @@ class Sensor:
 
         Accepts a number or an array of any kind, and returns the same kind and shape.
         """
+        require_numbers("pixels", pixels)
         gain, _, offset_dn = self.units
         return (pixels - offset_dn) / gain
 
@@ -276,11 +277,13 @@ class Sensor:
 
         Accepts a number or an array of any kind, and returns the same kind and shape.
         """
+        require_numbers("radiance", radiance)
         gain, _, offset_dn = self.units
         return radiance * gain + offset_dn
 
     def noise(self, radiance: ArrayLike) -> NDArray[np.float64]:
         """Return the standard deviation of the noise at radiances, each range at its middle."""
+        require_numbers("radiance", radiance)
         alpha, beta = self._middle_noise()
         return np.sqrt(np.maximum(alpha * np.asarray(radiance, np.float64) + beta, 0.0))
 

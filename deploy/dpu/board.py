@@ -41,6 +41,8 @@ def boards_of(board: BoardLike | Sequence[BoardLike]) -> list[TargetProfile]:
     else:
         # What is no board is refused when it is loaded.
         sources = [board]
+    if not sources:
+        raise OptionError("`target` names no board. Give a name, a .toml file, or all.")
     return list(map(TargetProfile.load, sources))
 
 

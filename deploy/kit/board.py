@@ -20,7 +20,7 @@ from beers_deploy.model.exposure import HEADROOM, SHARPEST, SHARPEST_IN_DARK
 from beers_deploy.model.io.files import require_writable, write_text
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.network_files import other_sensor
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError, as_path
 from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.shipped import BLIND, TILE_PX
 from beers_deploy.profiles.target import TargetProfile
@@ -94,13 +94,13 @@ class Board(TargetProfile):
                 nor an NPU.
             ProfileError: there is no such sensor.
         """
-        _require_tile(tile)
+        tile = _require_tile(tile)
         device_of(self)
-        require_writable(folders=[Path(out)])
+        folder = as_path(out)
+        require_writable(folders=[folder])
         profile = None if sensor is None else Sensor.load(sensor)
         images_of = profile or Sensor.load(BLIND)
         network = to_run_on(Network.load(int8, sensor=images_of), images_of)
-        folder = Path(out)
         warning = other_sensor(network.model, images_of)
         if warning:
             logger.warning(warning)
@@ -146,12 +146,13 @@ class Board(TargetProfile):
         return folder
 
 
-def _require_tile(tile: int) -> None:
-    """Raise OptionError if `tile` is not the side of a tile that a core can have."""
+def _require_tile(tile: int) -> int:
+    """Return the side of a tile, or raise OptionError if a core cannot have it."""
     if not isinstance(tile, int | np.integer) or not 16 <= tile <= 8192:
         raise OptionError(
             f"`tile` must be a whole number of 16 to 8192 px, got {tile!r}. Choose another."
         )
+    return int(tile)
 
 
 def _write_example(core: Network, folder: Path) -> None:

@@ -38,6 +38,8 @@ def sensors_of(sensor: SensorLike | Mapping[str, SensorLike]) -> dict[str, Senso
         BeersError: a profile cannot be loaded.
     """
     if isinstance(sensor, Mapping):
+        if not sensor:
+            raise OptionError("`sensor` names no band. Name each band with its sensor.")
         return {band: Sensor.load(profile) for band, profile in sensor.items()}
     # The path of one profile may have an equals sign in it.
     if not isinstance(sensor, str) or "=" not in sensor or Path(sensor).is_file():

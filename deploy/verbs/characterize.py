@@ -91,7 +91,7 @@ def contrasts(mtf: Any) -> tuple[float, float]:
     parts = list(mtf) if isinstance(mtf, list | tuple) else str(mtf).split(",")
     try:
         across, along = (float(part) for part in (parts * 2)[:2])
-    except ValueError:
+    except (TypeError, ValueError):
         # NaN lies within no limits, so the message below covers words as well.
         across = along = math.nan
     if len(parts) > 2 or not (0 < across <= MTF_NYQUIST_MAX and 0 < along <= MTF_NYQUIST_MAX):

@@ -175,7 +175,7 @@ else:
     VerdictFile = Annotated[Path, Written(verdict=True)]
     VerdictFolder = Annotated[Path, Written(folder=True, verdict=True)]
     NetworkLike = Networks = Annotated[str, Completed(network_names), Wider()]
-    ShippedOrFile = Annotated[str, Completed(network_names), Wider()]
+    ShippedOrFile = Annotated[Path, Completed(network_names)]
     SensorLike = BandSensors = Annotated[str, Completed(sensor_names), Wider()]
     ProfileName = Annotated[str, Completed(profile_names)]
     TargetLike = Targets = Annotated[str, Completed(target_names, listed=True), Wider()]

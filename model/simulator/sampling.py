@@ -76,6 +76,11 @@ def crop_divisible(radiance: np.ndarray, oversampling: int) -> np.ndarray:
     oversampling.
     """
     height, width = (size // oversampling * oversampling for size in radiance.shape[-2:])
+    if not (height and width):
+        raise ImageError(
+            f"The scene must have at least {oversampling} pixels a side, one pixel of the sensor. "
+            "Give a larger scene or a smaller oversampling."
+        )
     return radiance[..., :height, :width]
 
 

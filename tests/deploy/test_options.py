@@ -4,15 +4,19 @@ import re
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from inspect import Parameter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import beers_deploy as bd
 from beers_deploy.cli.commands import COMMANDS, app
-from beers_deploy.profiles.errors import BeersError, OptionError
+from beers_deploy.profiles.errors import BeersError, ImageError, OptionError
+from beers_deploy.quant.onnx.image_input import fixed_tile_px
 from beers_deploy.verbs.restore import restore
 from tests.deploy.verb_parameters import existing, options
 
@@ -208,6 +212,38 @@ def test_a_text_or_path_of_another_type_is_refused(name: str, value: object) -> 
         }
         with pytest.raises(OptionError, match=f"`{option}` must be a (path|text)"):
             function(**{**required, option: value})
+
+
+@pytest.mark.parametrize("value", [None, 3], ids=str)
+def test_what_is_no_path_of_an_output_is_refused(value: Any) -> None:
+    network = bd.Network.load("convbeers-xs-int8")
+    sensor = bd.Sensor.load("pleiades-degraded")
+    kit = partial(bd.Board.load("zcu104").kit, network)
+    for write in (network.save, sensor.save, bd.boards().save, kit):
+        with pytest.raises(OptionError, match=f"must be a path, got {value}"):
+            write(value)
+
+
+@pytest.mark.parametrize("value", [None, "raw.tif", Path("raw.tif")], ids=repr)
+def test_a_path_in_the_place_of_pixels_is_refused(value: Any) -> None:
+    network = bd.Network.load("convbeers-xs-int8")
+    sensor = bd.Sensor.load("pleiades-degraded")
+    for compute in (network, sensor.to_dn, sensor.to_radiance, sensor.noise):
+        with pytest.raises(ImageError, match="must be numbers or an array, got"):
+            compute(value)
+
+
+def test_the_side_of_a_core_may_be_an_integer_of_numpy_and_no_text() -> None:
+    network = bd.Network.load("convbeers-xs-int8")
+    assert fixed_tile_px(network.core(tile=np.int64(64)).model) == 70
+    for side in ("64", 0, -64, 64.0):
+        with pytest.raises(OptionError, match="`tile` must be a multiple of 1 px"):
+            network.core(tile=side)  # type: ignore[arg-type]
+
+
+def test_an_empty_list_of_boards_is_refused() -> None:
+    with pytest.raises(OptionError, match="`target` names no board"):
+        bd.bench("convbeers-xs", target=[], traditional=False)
 
 
 @pytest.mark.parametrize("kind", [np.uint16, np.float32])
