@@ -335,7 +335,7 @@ def gate_row(result: GateResult, shares: Mapping[str, float] | None = None) -> R
         entries[f"{result.metric} lost"] = (result.metric_loss, unit)
     if shares is not None:
         entries["PSNR drop"] = (result.drop_db, "dB")
-    missing = "a network gave NaN" if math.isnan(result.mae) else "no reference of that size"
+    missing = "a network gave NaN" if math.isnan(result.mae) else "no reference, or of another size"
     figures = {
         name: figure_of(value, unit, result.source, missing)
         for name, (value, unit) in entries.items()

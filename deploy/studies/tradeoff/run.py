@@ -33,6 +33,8 @@ from beers_deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes
 from beers_deploy.studies.tradeoff import advice
 from beers_deploy.studies.tradeoff.front import Comparison, Measured, front_rows, pareto_front
 from beers_deploy.studies.tradeoff.measure import (
+    ROUNDS,
+    TILE_PX,
     Benchmark,
     Scores,
     make_int8,
@@ -215,11 +217,14 @@ def preview(study: Study) -> Table:
         [partial(small.score, method.restore) for method in methods.values()], PREVIEW_RUNS
     )
     crops = sum(pair.degraded.size for pair in benchmark.pairs) / crop.size
+    # Each method is also timed on a tile, after a run to warm up.
+    tiles = (1 + ROUNDS) * TILE_PX**2 / crop.size
     # A point with seams restores each image twice: in its tiles, and exactly.
     seams = Counter(point.variant for point in points if point.halo_px is not None)
     low_s = high_s = 0.0
     for variant, samples in zip(methods, times, strict=True):
-        times_s = [(1 + 2 * seams[variant]) * crops * time_s for time_s, _ in samples]
+        runs = (1 + 2 * seams[variant]) * crops + tiles
+        times_s = [runs * time_s for time_s, _ in samples]
         low_s += min(times_s)
         high_s += max(times_s)
     counts = {"point": len(points), "method": len(methods), "image": len(benchmark.pairs)}
