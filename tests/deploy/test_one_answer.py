@@ -21,6 +21,7 @@ from tests.quant.quick import one_guess
 
 CHANNELS = 4
 GENERATOR = 5
+SAMPLES = np.random.default_rng(1).uniform(0, 1, (8, 1, 32, 32)).astype(np.float32)
 
 
 class Drawn(GraphWriter):
@@ -55,6 +56,16 @@ class Drawn(GraphWriter):
         weight = gain * self._generator.normal(0, 0.3, (outputs, inputs, 3, 3))
         name = self.constant(f"w{len(self.nodes)}", weight.astype(np.float32))
         return self.add("Conv", source, name, pads=[pad] * 4)
+
+    def save(self, path: Path, *results: str) -> Path:
+        """Write the network with these results of one channel to a file."""
+        infos = [
+            helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["N", 1, None, None])
+            for name in results
+        ]
+        graph = self.graph("drawn", [image_info("image", 1, None)], infos)
+        onnx.save(make_model(graph, {}), path)
+        return path
 
 
 Part = Callable[[Drawn, str], str]
@@ -141,12 +152,13 @@ def drawn(
     names = [w.node("Identity", "restored", [last])]
     if has_two:
         names.append(w.node("DepthToSpace", "large", [large], blocksize=2))
-    results = [
-        helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["N", 1, None, None])
-        for name in names
-    ]
-    onnx.save(make_model(w.graph("drawn", [image_info("image", 1, None)], results), {}), path)
-    return path
+    return w.save(path, *names)
+
+
+def quickly(network: Path, samples: np.ndarray = SAMPLES, **options: Any) -> bd.Network:
+    """Quantise a network without a search."""
+    with one_guess():
+        return bd.quantize(network, samples=samples, progress=False, **options)
 
 
 @settings(max_examples=15, deadline=None)
@@ -177,10 +189,7 @@ def test_commands_do_not_contradict_each_other(
     samples = from_shares(shares, (ends,))
     fits = bool(bd.check(path, tile=64, output=output))
     try:
-        with one_guess():
-            int8 = bd.quantize(
-                path, samples=samples, input_range=ends, output=output, progress=False
-            )
+        int8 = quickly(path, samples, input_range=ends, output=output)
     except ModelError:
         int8 = None
     # A network that a board does not run may be quantised: an activation behind a resize, for one.
@@ -216,16 +225,14 @@ def test_unpadded_networks_of_a_fixed_size_get_one_answer(tmp_path: Path) -> Non
         tmp_path / "a.onnx", ["relu", "valid"], adds_image=False, clips=False, padded=False
     )
     path = fixed(path, 32)
-    samples = np.random.default_rng(1).uniform(0, 1, (4, 1, 32, 32)).astype(np.float32)
     assert bd.check(path)
-    with one_guess():
-        int8 = bd.quantize(path, samples=samples, progress=False)
+    int8 = quickly(path)
     assert int8.table is not None
     assert not any("`restore`" in note for note in int8.table.notes)
-    assert int8(samples[:1]).shape == samples[:1].shape
-    assert bd.gate(path, int8, samples=samples, max_mae=0.1, progress=False)
+    assert int8(SAMPLES[:1]).shape == SAMPLES[:1].shape
+    assert bd.gate(path, int8, samples=SAMPLES, max_mae=0.1, progress=False)
     how: dict[str, Any] = {"full_scale": 1, "progress": False, "force": True, "tile": 32}
-    image = np.tile(samples[0, 0], (2, 2))
+    image = np.tile(SAMPLES[0, 0], (2, 2))
     for network in (path, int8):
         swath = bd.bench(network, tile=32, traditional=False)
         assert not any("whole images" in note for note in swath.notes)
@@ -245,9 +252,7 @@ def test_an_input_that_is_no_image_has_one_remedy(
 ) -> None:
     """Every command states the same reason, `check` in a table if the sizes fit a tile."""
     path = drawn(tmp_path / "a.onnx", ["relu"], adds_image=True, clips=False)
-    samples = np.random.default_rng(1).uniform(0, 1, (4, 1, 32, 32)).astype(np.float32)
-    with one_guess():
-        int8 = bd.quantize(path, samples=samples, progress=False)
+    int8 = quickly(path)
     model = onnx.load(path)
     (image,) = model.graph.input
     image.CopyFrom(helper.make_tensor_value_info("image", onnx.TensorProto.FLOAT, sizes))
@@ -260,10 +265,10 @@ def test_an_input_that_is_no_image_has_one_remedy(
 
     for command in (
         check,
-        lambda: bd.quantize(path, samples=samples, progress=False),
-        lambda: bd.gate(path, int8, samples=samples, progress=False),
+        lambda: quickly(path),
+        lambda: bd.gate(path, int8, samples=SAMPLES, progress=False),
         lambda: bd.bench(path, size="64x64", traditional=False),
-        lambda: bd.restore(samples[0, 0], network=path, full_scale=1, progress=False),
+        lambda: bd.restore(SAMPLES[0, 0], network=path, full_scale=1, progress=False),
     ):
         with pytest.raises(ModelError, match=f"The input 'image' must .* network {remedy}"):
             command()
@@ -276,17 +281,11 @@ def test_quantize_notes_that_restore_refuses_the_network(tmp_path: Path) -> None
     gate = w.add("HardSigmoid", w.conv(w.add("GlobalAveragePool", first), CHANNELS, CHANNELS))
     w.nodes[-1].attribute.append(helper.make_attribute("alpha", 1 / 6))
     last = w.conv(w.add("Mul", first, gate), 1, CHANNELS)
-    result = helper.make_tensor_value_info(last, onnx.TensorProto.FLOAT, ["N", 1, None, None])
-    graph = w.graph("drawn", [image_info("image", 1, None)], [result])
-    onnx.save(make_model(graph, {}), tmp_path / "a.onnx")
-    path = fixed(tmp_path / "a.onnx", 32)
-    samples = np.random.default_rng(1).uniform(0, 1, (4, 1, 32, 32)).astype(np.float32)
-    with one_guess():
-        int8 = bd.quantize(path, samples=samples, progress=False)
+    int8 = quickly(fixed(w.save(tmp_path / "a.onnx", last), 32))
     assert int8.table is not None
     assert any("`restore` does not run it" in note for note in int8.table.notes)
     with pytest.raises(ModelError, match="cannot be tiled"):
-        bd.restore(samples[0, 0], network=int8, full_scale=1, progress=False, force=True, tile=32)
+        bd.restore(SAMPLES[0, 0], network=int8, full_scale=1, progress=False, force=True, tile=32)
 
 
 def test_quantize_warns_of_what_the_board_refuses(
@@ -296,14 +295,10 @@ def test_quantize_warns_of_what_the_board_refuses(
     w = Drawn(1)
     first, second = (w.conv("image", CHANNELS, 1) for _ in range(2))
     leaky = w.add("LeakyRelu", w.add("Add", first, second), alpha=26 / 256)
-    last = w.conv(leaky, 1, CHANNELS)
-    result = helper.make_tensor_value_info(last, onnx.TensorProto.FLOAT, ["N", 1, None, None])
-    graph = w.graph("drawn", [image_info("image", 1, None)], [result])
-    onnx.save(make_model(graph, {}), tmp_path / "a.onnx")
-    samples = np.random.default_rng(1).uniform(0, 1, (4, 1, 32, 32)).astype(np.float32)
+    path = w.save(tmp_path / "a.onnx", w.conv(leaky, 1, CHANNELS))
     board = "zcu102"
-    with one_guess(), caplog.at_level(logging.WARNING, "beers_deploy"):
-        int8 = bd.quantize(tmp_path / "a.onnx", samples=samples, target=board, progress=False)
+    with caplog.at_level(logging.WARNING, "beers_deploy"):
+        int8 = quickly(path, target=board)
     (warning,) = (record.getMessage() for record in caplog.records)
     assert warning.startswith(f"{board} does not run it: check FAILED")
     assert "LeakyRelu stands behind add" in warning
@@ -322,10 +317,5 @@ def test_a_network_after_adapt_passes_behind_any_operation(kind: str, tmp_path: 
     source = w.add(kind, *feeds, **attributes)
     silu = w.add("Mul", source, w.add("Sigmoid", source))
     last = w.conv(silu, 1, CHANNELS * (2 if kind == "Concat" else 1))
-    result = helper.make_tensor_value_info(last, onnx.TensorProto.FLOAT, ["N", 1, None, None])
-    graph = w.graph("drawn", [image_info("image", 1, None)], [result])
-    onnx.save(make_model(graph, {}), tmp_path / "a.onnx")
-    samples = np.random.default_rng(1).uniform(0, 1, (8, 1, 32, 32)).astype(np.float32)
-    with one_guess():
-        int8 = bd.quantize(tmp_path / "a.onnx", samples=samples, adapt=True, progress=False)
-    assert bd.check(int8)
+    path = w.save(tmp_path / "a.onnx", last)
+    assert bd.check(quickly(path, adapt=True))
