@@ -1,9 +1,11 @@
 """Test that any text of the network stays text in the outputs of the action."""
 
+import io
 import json
 import os
 import re
 import runpy
+from contextlib import redirect_stdout
 from html import unescape
 from itertools import chain
 from pathlib import Path
@@ -31,19 +33,21 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("job")
 
 
-def reported(folder: Path, code: int, document: object, stderr: str = "") -> tuple[str, str]:
-    """Return the summary and the outputs of a run that the gate ended with this code."""
+def reported(folder: Path, code: int, document: object, stderr: str = "") -> tuple[str, str, str]:
+    """Return the summary, the outputs and what is printed for a run that ended with this code."""
     names = "GITHUB_OUTPUT", "GITHUB_STEP_SUMMARY"
     for name in names:
         (folder / name).write_bytes(b"")
         os.environ[name] = str(folder / name)
     (folder / "gate.json").write_text(json.dumps(document), encoding="utf-8")
     (folder / "stderr").write_text(stderr, encoding="utf-8", errors="surrogatepass")
-    VERDICT["main"](code, folder / "gate.json", folder / "stderr")
+    printed = io.StringIO()
+    with redirect_stdout(printed):
+        VERDICT["main"](code, folder / "gate.json", folder / "stderr")
     texts = [(folder / name).read_text(encoding="utf-8") for name in names]
     for name in names:
         del os.environ[name]
-    return texts[1], texts[0]
+    return texts[1], texts[0], printed.getvalue()
 
 
 def failed(name: str, detail: str) -> dict[str, Any]:
@@ -61,10 +65,7 @@ def rendered(markdown: str) -> str:
 def test_a_check_is_one_row_of_plain_text_and_one_annotation(
     folder: Path, name: str, detail: str
 ) -> None:
-    capture: list[str] = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.stdout.write", capture.append)
-        summary, outputs = reported(folder, 1, failed(name, detail))
+    summary, outputs, printed = reported(folder, 1, failed(name, detail))
     assert outputs == "verdict=failed\nmae=0.0006\n"
     html = rendered(summary)
     cells = re.findall("<td>(.*)</td>", html)
@@ -74,9 +75,8 @@ def test_a_check_is_one_row_of_plain_text_and_one_annotation(
     ]
     assert not any("<" in cell for cell in (cells[0], cells[-1])), "no markup"
     assert all(letter.isprintable() or letter == "\n" for letter in summary)
-    (line,) = capture
-    assert line.startswith("::error title=INT8 gate%3A ")
-    assert line.count("\n") == 1
+    assert printed.startswith("::error title=INT8 gate%3A ")
+    assert printed.count("\n") == 1
 
 
 @settings(max_examples=40)
@@ -85,15 +85,12 @@ def test_a_check_is_one_row_of_plain_text_and_one_annotation(
 @example("````")
 def test_the_last_message_is_a_block_of_code(folder: Path, reason: str) -> None:
     """Progress, log records and warnings come before the message on standard error."""
-    capture: list[str] = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.stdout.write", capture.append)
-        summary, outputs = reported(
-            folder,
-            2,
-            {"verdict": "passed"},
-            f"beers-deploy: earlier\nwarning: doubt\nprogress\nbeers-deploy: {reason}\n",
-        )
+    summary, outputs, printed = reported(
+        folder,
+        2,
+        {"verdict": "passed"},
+        f"beers-deploy: earlier\nwarning: doubt\nprogress\nbeers-deploy: {reason}\n",
+    )
     assert outputs == "verdict=error\n"
     html = rendered(summary)
     assert html.startswith("<h2>INT8 gate: not judged</h2>\n<pre><code")
@@ -101,20 +98,18 @@ def test_the_last_message_is_a_block_of_code(folder: Path, reason: str) -> None:
     assert html.count("<pre>") == 1
     assert not any(word in html for word in ("earlier", "doubt", "progress"))
     assert all(letter.isprintable() or letter == "\n" for letter in summary)
-    assert capture[0].count("\n") == 1
+    assert printed.count("\n") == 1
 
 
 @pytest.mark.parametrize(
     ("code", "document"),
     [(0, {"verdict": "failed"}), (1, {"verdict": "passed"}), (1, []), (0, 3), (137, {})],
 )
-def test_a_document_of_another_run_is_no_verdict(
-    code: int, document: object, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    summary, outputs = reported(folder, code, document, "Traceback\nKilled\n")
+def test_a_document_of_another_run_is_no_verdict(code: int, document: object, folder: Path) -> None:
+    summary, outputs, printed = reported(folder, code, document, "Traceback\nKilled\n")
     assert outputs == "verdict=error\n"
     assert "Killed" in summary
-    assert capsys.readouterr().out == "::error title=INT8 gate%3A not judged::Traceback%0AKilled\n"
+    assert printed == "::error title=INT8 gate%3A not judged::Traceback%0AKilled\n"
 
 
 def workflows() -> list[Path]:

@@ -162,19 +162,18 @@ def test_transposed_convolutions_that_the_dpu_lacks_are_refused(
         read_network(behind_conv(write))
 
 
-def test_two_outputs_are_refused_by_name() -> None:
-    model = behind_conv(lambda w: w.node("Relu", "restored", ["x"]))
-    model.graph.output.append(
-        helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, ["N", 2, "H", "W"])
-    )
-    with pytest.raises(ModelError, match=r"one output, but it has 2: restored, x.*as `output`"):
-        read_network(model)
-
-
-def test_two_inputs_are_refused_by_name() -> None:
-    model = behind_conv(lambda w: w.node("Add", "restored", ["x", "level"]))
-    model.graph.input.append(
-        helper.make_tensor_value_info("level", onnx.TensorProto.FLOAT, ["N", 1, "H", "W"])
-    )
-    with pytest.raises(ModelError, match=r"has 2: image, level\. Concatenate them"):
+@pytest.mark.parametrize(
+    ("end", "name", "channels", "message"),
+    [
+        ("output", "x", 2, "one output, but it has 2: restored, x.*as `output`"),
+        ("input", "level", 1, r"has 2: image, level\. Concatenate them"),
+    ],
+)
+def test_two_inputs_or_outputs_are_refused_by_name(
+    end: str, name: str, channels: int, message: str
+) -> None:
+    model = behind_conv(lambda w: w.node("Add", "restored", ["x", name]))
+    info = helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["N", channels, "H", "W"])
+    getattr(model.graph, end).append(info)
+    with pytest.raises(ModelError, match=message):
         read_network(model)

@@ -28,6 +28,9 @@ class Masked(ArrayPixels):
         return mask
 
 
+PIXELS = np.random.default_rng(0).integers(0, 4096, (1, 300, 280)).astype(np.uint16)
+
+
 @settings(max_examples=25)
 @given(
     st.sampled_from(get_args(Compression)),
@@ -65,30 +68,26 @@ def test_every_type_and_compression_is_read_back(
 def test_a_file_that_differs_from_what_was_written_is_an_error(
     compression: Compression, tmp_path: Path
 ) -> None:
-    pixels = np.random.default_rng(0).integers(0, 4096, (1, 300, 280)).astype(np.uint16)
-    raster = Raster(1, 300, 280, pixels.dtype)
+    raster = Raster(1, 300, 280, PIXELS.dtype)
     path = tmp_path / "a.tif"
-    write_raster(path, raster, ArrayPixels(pixels), compression)
+    write_raster(path, raster, ArrayPixels(PIXELS), compression)
     content = bytearray(path.read_bytes())
     content[20_000] ^= 1
-    path.write_bytes(content)
-    with pytest.raises(OSError, match=r"\w"):
-        require_equal(path, raster, ArrayPixels(pixels))
-    path.write_bytes(content[: len(content) // 2])
-    with pytest.raises(OSError, match=r"\w"):
-        require_equal(path, raster, ArrayPixels(pixels))
+    for damaged in (content, content[: len(content) // 2]):
+        path.write_bytes(damaged)
+        with pytest.raises(OSError, match=r"\w"):
+            require_equal(path, raster, ArrayPixels(PIXELS))
 
 
 @pytest.mark.parametrize("mask_kind", ["mask", "alpha"])
 def test_a_mask_that_differs_from_what_was_written_is_an_error(
     mask_kind: MaskKind, tmp_path: Path
 ) -> None:
-    pixels = np.random.default_rng(0).integers(0, 4096, (1, 300, 280)).astype(np.uint16)
-    raster = Raster(1, 300, 280, pixels.dtype, mask_kind=mask_kind)
+    raster = Raster(1, 300, 280, PIXELS.dtype, mask_kind=mask_kind)
     path = tmp_path / "a.tif"
-    write_raster(path, raster, Masked(pixels), "zlib")
+    write_raster(path, raster, Masked(PIXELS), "zlib")
     with pytest.raises(OSError, match="other pixels"):
-        require_equal(path, raster, ArrayPixels(pixels))
+        require_equal(path, raster, ArrayPixels(PIXELS))
 
 
 @pytest.mark.parametrize("limit_bytes", [1000, 40_000, 100_000])
@@ -97,17 +96,16 @@ def test_a_file_that_cannot_grow_is_an_error_with_its_cause(
 ) -> None:
     """A limit on the size of files simulates a full disk."""
     resource = pytest.importorskip("resource", reason="Windows has no such limit")
-    dn = np.random.default_rng(0).integers(0, 4096, (300, 280)).astype(np.uint16)
-    raster = Raster(1, 300, 280, dn.dtype)
+    raster = Raster(1, 300, 280, PIXELS.dtype)
     cause = os.strerror(errno.EFBIG)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, hard))
     try:
         with pytest.raises(OSError, match=cause):
-            write_raster(tmp_path / "a.tif", raster, ArrayPixels(dn[None]), "zlib")
+            write_raster(tmp_path / "a.tif", raster, ArrayPixels(PIXELS), "zlib")
         capfd.readouterr()
         with pytest.raises(MachineError, match=rf"b\.tif cannot be written: {cause}\. Choose"):
-            write_tiff(tmp_path / "b.tif", dn)
+            write_tiff(tmp_path / "b.tif", PIXELS[0])
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     # libtiff prints nothing in addition to the sentence.

@@ -5,6 +5,7 @@ refused in one sentence.
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,6 +43,14 @@ def boxes_of(labelled: LabelledSet) -> dict[str, list[tuple[object, ...]]]:
 def by_voc(folder: Path, content: str, name: str = "a.xml") -> Path:
     """Write an image a.png and a file of labels next to it."""
     return text(image(folder / "a.png").with_name(name), content)
+
+
+def rewritten(folder: Path, change: Callable[[Any], object]) -> None:
+    """Write a folder of labels in COCO's layout, and change the content of its file."""
+    path = coco(folder) / "labels.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
 
 
 def refused(folder: Path, sentence: str) -> None:
@@ -186,24 +195,19 @@ def test_a_huge_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
             "KeyError: 9",
         ),
         ({"categories": [{"id": 7, "name": 5}]}, "TypeError: "),
-        (
-            {"images": [{"id": 0, "file_name": "../../etc/passwd"}]},
-            "None of the 1 images that .*labels.json lists",
-        ),
-        (
-            {"images": [{"id": 0, "file_name": "/etc/passwd"}]},
-            "None of the 1 images that .*labels.json lists",
+        *(
+            (
+                {"images": [{"id": 0, "file_name": name}], "annotations": []},
+                "None of the 1 images that .*labels.json lists",
+            )
+            for name in ("../../etc/passwd", "/etc/passwd")
         ),
     ],
 )
 def test_a_faulty_coco_file_is_refused_by_a_sentence(
     damage: dict[str, object], sentence: str, tmp_path: Path
 ) -> None:
-    path = coco(tmp_path) / "labels.json"
-    content = json.loads(path.read_text()) | damage
-    if damage.get("images"):
-        content["annotations"] = []
-    path.write_text(json.dumps(content))
+    rewritten(tmp_path, lambda content: content.update(damage))
     refused(tmp_path, sentence)
 
 
@@ -233,21 +237,18 @@ def test_images_that_coco_does_not_list_are_counted_and_one_listed_twice_is_refu
 
 
 def test_labels_of_which_no_object_counts_are_refused(tmp_path: Path) -> None:
-    path = coco(tmp_path) / "labels.json"
-    content = json.loads(path.read_text())
-    for annotation in content["annotations"]:
-        annotation["iscrowd"] = 1
-    path.write_text(json.dumps(content))
+    def forgive(content: Any) -> None:
+        for annotation in content["annotations"]:
+            annotation["iscrowd"] = 1
+
+    rewritten(tmp_path, forgive)
     refused(tmp_path, "at least one object that counts, but they have none on 2 images")
 
 
 def test_images_missing_from_the_folder_are_counted_and_a_crowd_need_not_be_found(
     tmp_path: Path,
 ) -> None:
-    path = coco(tmp_path) / "labels.json"
-    content = json.loads(path.read_text())
-    content["annotations"][-1]["iscrowd"] = 1
-    path.write_text(json.dumps(content))
+    rewritten(tmp_path, lambda content: content["annotations"][-1].update(iscrowd=1))
     (tmp_path / "00002.png").unlink()
     labelled = read_labelled(tmp_path)
     assert [path.stem for path, _ in labelled.images] == ["00001"]
