@@ -51,11 +51,18 @@ def dataset(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def copy(dataset: Path, tmp_path: Path) -> Path:
+    """Copy the small dataset, for a test that damages it."""
+    return Path(shutil.copytree(dataset, tmp_path / "copy"))
+
+
 VARIABLE = Sensor.load("pleiades-variable")
+DEGRADED = Sensor.load("pleiades-degraded")
 REFERENCE = Sensor.load("pleiades-reference")
 
 
-def small(scene: Path, patch_px: int | None = 24) -> DatasetRecipe:
+def small(scene: Path, patch_px: int = 24) -> DatasetRecipe:
     return DatasetRecipe((scene, scene), VARIABLE, REFERENCE, oversampling=2, patch_px=patch_px)
 
 
@@ -63,6 +70,12 @@ def bytes_of(folder: Path) -> dict[str, bytes]:
     return {
         str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()
     }
+
+
+def resume(scene: Path, folder: Path, dataset: Path) -> None:
+    """Resume a dataset, and check that it has the bytes of the undamaged one."""
+    write_dataset(small(scene), folder, 1, resume=True)
+    assert bytes_of(folder) == bytes_of(dataset)
 
 
 @pytest.mark.slow
@@ -163,14 +176,12 @@ DAMAGES: dict[str, tuple[str, Callable[[Path], None], int]] = {
 
 @pytest.mark.parametrize("kind", DAMAGES)
 def test_damaged_pairs_of_a_finished_dataset_are_simulated_again(
-    kind: str, scene: Path, dataset: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    kind: str, scene: Path, dataset: Path, copy: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     name, damage, count = DAMAGES[kind]
-    folder = Path(shutil.copytree(dataset, tmp_path / "damaged"))
-    damage(folder / name)
+    damage(copy / name)
     with caplog.at_level(logging.WARNING, "beers_deploy"):
-        write_dataset(small(scene), folder, 1, resume=True)
-    assert bytes_of(folder) == bytes_of(dataset)
+        resume(scene, copy, dataset)
     if count:
         assert [message.split(" ")[0] for message in caplog.messages] == [str(count)]
     assert len(caplog.messages) <= 1
@@ -192,56 +203,48 @@ FORGED: dict[str, Callable[[Line], object]] = {
 
 @pytest.mark.parametrize("kind", FORGED)
 def test_a_forged_line_with_its_digest_is_simulated_again(
-    kind: str, scene: Path, dataset: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    kind: str, scene: Path, dataset: Path, copy: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    folder = Path(shutil.copytree(dataset, tmp_path / "forged"))
-    lines = (folder / "manifest.jsonl").read_text().splitlines(keepends=True)
+    manifest = copy / "manifest.jsonl"
+    lines = manifest.read_text().splitlines(keepends=True)
     line = json.loads(lines[0])
     del line[DIGESTS]
     FORGED[kind](line)
-    (folder / "manifest.jsonl").write_text("".join([line_text(folder, line), *lines[1:]]))
+    manifest.write_text("".join([line_text(copy, line), *lines[1:]]))
     with caplog.at_level(logging.WARNING, "beers_deploy"):
-        write_dataset(small(scene), folder, 1, resume=True)
-    assert bytes_of(folder) == bytes_of(dataset)
+        resume(scene, copy, dataset)
     assert caplog.messages[0].startswith("1 of ")
 
 
-def test_only_partial_files_of_a_run_are_deleted(
-    scene: Path, dataset: Path, tmp_path: Path
-) -> None:
-    folder = Path(shutil.copytree(dataset, tmp_path / "left"))
-    ours = [folder / "degraded" / ".a.tif.123.part", folder / ".manifest.jsonl.9.part"]
-    foreign = [folder / "mine" / ".b.tif.123.part", folder / ".mine.part"]
+def test_only_partial_files_of_a_run_are_deleted(scene: Path, copy: Path) -> None:
+    ours = [copy / "degraded" / ".a.tif.123.part", copy / ".manifest.jsonl.9.part"]
+    foreign = [copy / "mine" / ".b.tif.123.part", copy / ".mine.part"]
     foreign[0].parent.mkdir()
     for path in (*ours, *foreign):
         path.touch()
-    write_dataset(small(scene), folder, 1, resume=True)
+    write_dataset(small(scene), copy, 1, resume=True)
     assert [path.exists() for path in (*ours, *foreign)] == [False, False, True, True]
 
 
 @pytest.mark.parametrize("damage", [flip, Path.unlink])
 def test_a_damaged_part_of_an_unfinished_dataset_is_simulated_again(
-    damage: Callable[[Path], None], scene: Path, dataset: Path, tmp_path: Path
+    damage: Callable[[Path], None], scene: Path, dataset: Path, copy: Path
 ) -> None:
-    folder = Path(shutil.copytree(dataset, tmp_path / "unfinished"))
-    (folder / "parts").mkdir()
-    lines = (folder / "manifest.jsonl").read_text().splitlines(keepends=True)
-    part = folder / "parts" / "00000000.jsonl"
-    part.write_text("".join(lines[:5]))
-    (folder / "manifest.jsonl").unlink()
+    manifest = copy / "manifest.jsonl"
+    part = copy / "parts" / "00000000.jsonl"
+    part.parent.mkdir()
+    part.write_text("".join(manifest.read_text().splitlines(keepends=True)[:5]))
+    manifest.unlink()
     damage(part)
-    write_dataset(small(scene), folder, 1, resume=True)
-    assert bytes_of(folder) == bytes_of(dataset)
+    resume(scene, copy, dataset)
 
 
 def test_a_recipe_with_the_line_ends_of_windows_is_the_same(
-    scene: Path, dataset: Path, tmp_path: Path
+    scene: Path, dataset: Path, copy: Path
 ) -> None:
-    folder = Path(shutil.copytree(dataset, tmp_path / "other"))
-    recipe = folder / "recipe.json"
+    recipe = copy / "recipe.json"
     recipe.write_bytes(recipe.read_bytes().replace(b"\n", b"\r\n"))
-    write_dataset(small(scene), folder, 1, resume=True)
-    assert bytes_of(folder) == bytes_of(dataset)
+    resume(scene, copy, dataset)
 
 
 def test_a_scene_without_room_for_a_patch_is_refused(scene: Path) -> None:
@@ -265,44 +268,42 @@ def test_every_effect_has_a_typical_value_and_every_scene_loads() -> None:
     assert [*typical_effects()] == [*TABLES]
     assert len(TABLES) == 9
     assert scene_names() == ["desert-noon", "haze-over-sea", "night-port", "snow"]
-    profile = Sensor.load("pleiades-degraded")
     for name in scene_names():
         call = SceneCall.load(name)
-        assert set(calling_for(profile, call).effects) == set(call.effects)
+        assert set(calling_for(DEGRADED, call).effects) == set(call.effects)
+
+
+HAZE = SceneCall.load("haze-over-sea")
 
 
 def test_effects_are_added_and_forbidden() -> None:
-    profile = Sensor.load("pleiades-degraded")
-    haze = SceneCall.load("haze-over-sea")
-    assert set(calling_for(profile, haze, ["prnu"], ["veil"]).effects) == {"striping", "prnu"}
-    transmittance = calling_for(profile, haze, ["veil"]).effects["veil"]["transmittance"]
+    assert set(calling_for(DEGRADED, HAZE, ["prnu"], ["veil"]).effects) == {"striping", "prnu"}
+    transmittance = calling_for(DEGRADED, HAZE, ["veil"]).effects["veil"]["transmittance"]
     # This is the scene's own value, not the typical one.
     assert transmittance.low == 0.6
     with pytest.raises(OptionError, match="clouds"):
-        calling_for(profile, None, ["clouds"])
+        calling_for(DEGRADED, None, ["clouds"])
     for name in TABLES:
         with pytest.raises(OptionError, match=f"both adds and forbids {name} "):
-            calling_for(profile, None, ["prnu", name], [name])
+            calling_for(DEGRADED, None, ["prnu", name], [name])
 
 
 def test_each_effect_has_its_origin() -> None:
-    profile = Sensor.load("pleiades-degraded")
-    haze = SceneCall.load("haze-over-sea")
     base = {"mtf": "sensor pleiades-degraded", "noise": "sensor pleiades-degraded"}
-    assert origins(profile, None) == base
-    assert origins(profile, haze, ["prnu", "striping"], ["veil"]) == base | {
+    assert origins(DEGRADED, None) == base
+    assert origins(DEGRADED, HAZE, ["prnu", "striping"], ["veil"]) == base | {
         "veil": "left out by `without`",
         "striping": "scene haze-over-sea",
         "prnu": "`with_`",
     }
-    striped = replace(profile, effects=typical_effects())
+    striped = replace(DEGRADED, effects=typical_effects())
     assert (
-        origins(striped, replace(haze, without=("dsnu",)))["dsnu"]
+        origins(striped, replace(HAZE, without=("dsnu",)))["dsnu"]
         == "left out by scene haze-over-sea"
     )
-    for scene, add in ((None, []), (haze, ["prnu"])):
-        added = {name for name in origins(profile, scene, add) if name not in base}
-        assert added == set(calling_for(profile, scene, add).effects)
+    for scene, add in ((None, []), (HAZE, ["prnu"])):
+        added = {name for name in origins(DEGRADED, scene, add) if name not in base}
+        assert added == set(calling_for(DEGRADED, scene, add).effects)
 
 
 @pytest.fixture(scope="module")
@@ -317,7 +318,7 @@ def scheduler() -> Iterator[str]:
 def test_a_scheduler_s_workers_give_the_same_bytes(
     scene: Path, scheduler: str, tmp_path: Path
 ) -> None:
-    recipe = DatasetRecipe((scene, scene), VARIABLE, REFERENCE, oversampling=2, patch_px=12)
+    recipe = small(scene, patch_px=12)
     assert len(plan_windows(recipe)) > 2 * CHUNK
     write_dataset(recipe, tmp_path / "here", 1, resume=False)
     progress: list[Step] = []

@@ -49,7 +49,7 @@ def test_the_same_numbers_are_the_same_sensor_and_others_are_not(
         ("c", "value = 0.07", "value = 0.08"),
     ):
         (tmp_path / folder).mkdir()
-        sensor = Sensor.load(str(own_sensor(tmp_path / folder, (old, new))))
+        sensor = Sensor.load(own_sensor(tmp_path / folder, (old, new)))
         networks.append(Network.load(conditioned, sensor=sensor))
     weights = [
         [tensor.raw_data for tensor in network.model.graph.initializer] for network in networks
@@ -74,7 +74,7 @@ def test_int8_is_calibrated_once_and_then_conditioned_on_any_sensor(
     other = load_onnx(Path("mine.onnx"))
     assert (metadata(base)["sensor"], metadata(other)["sensor"]) == (
         SENSOR,
-        Sensor.load(str(sensor)).name,
+        Sensor.load(sensor).name,
     )
     again = int8_for_sensor(other, KNOWN)
     assert again.SerializeToString(deterministic=True) == base.SerializeToString(deterministic=True)
@@ -117,7 +117,7 @@ def test_blind_is_the_middle_of_a_range_of_sensors() -> None:
 def test_a_value_outside_the_training_is_reported_each_time(
     conditioned: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    sensor = Sensor.load(str(own_sensor(tmp_path, ("value = 0.07", "value = 0.004"))))
+    sensor = Sensor.load(own_sensor(tmp_path, ("value = 0.07", "value = 0.004")))
     for _ in range(2):
         Network.load(conditioned, sensor=sensor)
     assert [record.levelno for record in caplog.records] == 4 * [logging.WARNING]

@@ -161,7 +161,7 @@ def quickly(network: Path, samples: np.ndarray = SAMPLES, **options: Any) -> bd.
         return bd.quantize(network, samples=samples, progress=False, **options)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(
     parts=st.lists(st.sampled_from(sorted(PARTS)), max_size=3),
     adds_image=st.booleans(),

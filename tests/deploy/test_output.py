@@ -29,7 +29,7 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return drawn(path, ["relu"], adds_image=True, clips=True, has_two=True)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(
     output=st.sampled_from(OUTPUTS),
     sides=st.tuples(SIDES, SIDES),

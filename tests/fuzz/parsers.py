@@ -135,7 +135,7 @@ def recipe_seeds(folder: Path) -> list[bytes]:
     """Return a recipe of pairs whose sensors have an MTF table and a point-spread function."""
     path = folder / "a.toml"
     path.write_bytes(described_seeds(folder)[0])
-    profile = Sensor.load(str(path))
+    profile = Sensor.load(path)
     (folder / "point.npy").write_bytes(point_seeds(folder)[0])
     point = PointSpreadFile("point.npy", 4.0).read("a test", folder)
     across, along = (replace(profile.mtf_nyquist, value=value) for value in point.at_nyquist)
@@ -216,7 +216,7 @@ def read_manifest(path: Path) -> None:
 
 def board_of(path: Path) -> None:
     """Load a user's target, place a network on it, and predict its time."""
-    TargetProfile.load(str(path))
+    TargetProfile.load(path)
     dpu = load_dpu(str(path))
     Layers.of(count_work(place(_network(), dpu).core, dpu), dpu)
 
@@ -255,12 +255,8 @@ PARSERS: tuple[Parser, ...] = (
     Parser("PNG", ".png", lambda _: [image_of({"format": "PNG"})], read_pixels),
     Parser("JPEG", ".jpg", lambda _: [image_of({"format": "JPEG"})], read_pixels),
     *(gdal_parser(kind, name) for kind, name in GDAL.items()),
-    Parser(
-        "sensor TOML", ".toml", lambda _: _files("sensors"), lambda p: Sensor.load(str(p)).nominal()
-    ),
-    Parser(
-        "sensor TOML, MTF table", ".toml", described_seeds, lambda p: Sensor.load(str(p)).nominal()
-    ),
+    Parser("sensor TOML", ".toml", lambda _: _files("sensors"), lambda p: Sensor.load(p).nominal()),
+    Parser("sensor TOML, MTF table", ".toml", described_seeds, lambda p: Sensor.load(p).nominal()),
     Parser("point spread, npy", ".npy", point_seeds, read_point),
     Parser("recipe of pairs", ".json", recipe_seeds, read_recipe, damage_json),
     Parser("scene TOML", ".toml", lambda _: _files("scenes"), lambda p: SceneCall.load(str(p))),

@@ -104,7 +104,7 @@ def error(kernel: np.ndarray, instrument: Instrument, epsilon: float) -> float:
     return float(errors.mean())
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(CONTRAST, CONTRAST, st.floats(36, 219), st.integers(0, 2**20))
 def test_no_other_kernel_of_its_size_restores_better(
     across: float, along: float, snr: float, seed: int

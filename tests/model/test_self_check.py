@@ -178,7 +178,7 @@ def spans(size_px: int, cuts: set[int]) -> list[Placed]:
     down=st.sets(st.integers(1, ROWS // BLOCK_PX), max_size=3),
     across=st.sets(st.integers(1, COLUMNS // BLOCK_PX), max_size=2),
 )
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 def test_windows_give_the_blocks_of_the_whole_image(down: set[int], across: set[int]) -> None:
     """Windows of any cut give the blocks that the whole image gives, so a large image may be
     judged in parts.

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.profiles.arrays import ALONE, load_arrays
@@ -32,7 +32,6 @@ def test_the_content_tells_an_archive_from_an_array(tmp_path: Path) -> None:
     }
 
 
-@settings(max_examples=100, deadline=None)
 @given(
     kind=st.sampled_from(["npy", "npz"]),
     places=st.dictionaries(st.floats(0, 0.999), st.integers(0, 255), max_size=4),

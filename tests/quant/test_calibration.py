@@ -85,7 +85,7 @@ def test_a_whole_response_stays_with_every_view(scenes: list[Scene]) -> None:
     assert len({view.degraded.noise_sigma(25) for view in views}) == 3
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(count=st.integers(1, 30), size=st.integers(1, 9), seed=st.integers(0, 2**31))
 def test_each_stratum_gives_one_pick(count: int, size: int, seed: int) -> None:
     generator = np.random.default_rng(seed)

@@ -121,7 +121,7 @@ def same_integers(one: IntCore, other: IntCore) -> bool:
     return True
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.lists(st.integers(-8, 8), min_size=1, max_size=4), st.booleans())
 def test_a_network_of_scaled_channels_has_the_same_integers(
     exponents: list[int], signed: bool
@@ -144,7 +144,7 @@ def test_a_network_of_scaled_channels_has_the_same_integers(
     np.testing.assert_array_equal(actual, expected)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     ranges=RANGES,
     sides=st.tuples(SIDES, SIDES),
@@ -176,7 +176,7 @@ def test_padding_stays_zero(
     np.testing.assert_allclose(actual, expected, atol=36 * 1.5 * 30 / (2 * MAX_DN))
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(
     ranges=RANGES,
     adds_image=st.booleans(),
@@ -242,7 +242,7 @@ def test_the_encoding_errs_by_half_a_step(ends: tuple[float, float], dn: int) ->
     assert abs(decoded - float(value)) <= 0.501 * step
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.lists(st.integers(1, 9), min_size=1, max_size=4), st.floats(0, 0.01))
 def test_figures_do_not_depend_on_the_unit(exponents: list[int], error: float) -> None:
     """Networks that differ by `error` are compared with the same figures, whatever the unit.

@@ -114,7 +114,7 @@ def by_definition(model: onnx.ModelProto, image: np.ndarray) -> np.ndarray:
     large=st.booleans(),
     seed=st.integers(0, 2**32 - 1),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_any_convolution_sums_exactly(
     shape: tuple[int, int, int, int],
     kind: type[np.uint8 | np.int8],
@@ -152,7 +152,7 @@ def test_plain_graphs_saturate_where_the_processor_does() -> None:
     seed=st.integers(0, 2**32 - 1),
     size=st.sampled_from([63, 70, 128]),
 )
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_the_proof_holds_for_the_worst_activations(
     inputs: int, kernel: int, largest: int, seed: int, size: int
 ) -> None:

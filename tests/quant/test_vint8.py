@@ -69,7 +69,7 @@ NETWORKS = pytest.mark.parametrize("graph", [residual(), unet(), pools()])
 
 
 @NETWORKS
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(data=st.data(), tile_px=st.sampled_from([5, 9, 17, 31]), seed=st.integers(0, 99))
 def test_it_computes_the_bits_of_the_host_file(
     graph: Graph, data: st.DataObject, tile_px: int, seed: int

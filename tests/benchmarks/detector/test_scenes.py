@@ -39,7 +39,7 @@ def unlimited(canvas: Canvas) -> Plot:
     return Plot(canvas, turn(0, 0, 0), math.inf)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.sampled_from(range(4)), st.floats(0, math.tau), st.integers(0, 2**32))
 def test_a_box_is_the_pixels_that_the_object_changed(kind: int, angle: float, seed: int) -> None:
     canvas = Canvas(400, 420, np.random.default_rng(seed))

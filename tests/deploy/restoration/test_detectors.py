@@ -71,7 +71,7 @@ def test_all_kinds_are_found_in_each_band_and_in_floats() -> None:
     assert faults_of(faulty(), nodata=0.0) == [Fault(-1, 100), Fault(80, 20)]
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(st.integers(1, 300), st.integers(0, 2**20))
 def test_the_pixels_are_the_same_however_rows_are_read(step_px: int, seed: int) -> None:
     generator = np.random.default_rng(seed)

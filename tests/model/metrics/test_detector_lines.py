@@ -29,7 +29,7 @@ def noisy(image: np.ndarray, generator: np.random.Generator, noise: float = 4.0)
     return np.asarray(np.rint(image + generator.normal(0, noise, image.shape)), np.float32)
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(seeds, st.integers(16, 180), st.floats(50, 3000), st.sampled_from([2.0, 4.0, 40.0]))
 def test_flat_ground_has_no_lines(seed: int, width: int, level: float, noise: float) -> None:
     faults = judged(noisy(np.full((512, width), level), np.random.default_rng(seed), noise))
@@ -38,7 +38,7 @@ def test_flat_ground_has_no_lines(seed: int, width: int, level: float, noise: fl
     assert not faults.dead
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(seeds, st.integers(250, 500), st.floats(0.006, 0.03))
 def test_the_spread_of_the_gains_is_measured(seed: int, width: int, rms: float) -> None:
     generator = np.random.default_rng(seed)
@@ -48,7 +48,7 @@ def test_the_spread_of_the_gains_is_measured(seed: int, width: int, rms: float) 
     assert faults.spread == pytest.approx(rms, rel=0.5)
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(seeds, st.integers(4, 95), st.sampled_from([-0.2, -0.02, 0.01, 0.3]))
 def test_a_single_column_is_found_with_its_gain(seed: int, column: int, gain: float) -> None:
     image = np.full((512, 100), 600.0)
@@ -72,7 +72,7 @@ def test_a_blurred_road_along_the_columns_is_a_scene(
     assert not judged(noisy(image, np.random.default_rng(shift_px))).off
 
 
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 @given(seeds, st.sampled_from([0.0, 7.0, 4095.0]), st.integers(1, 98))
 def test_a_dead_column_is_found_and_its_neighbours_are_not(
     seed: int, value: float, column: int

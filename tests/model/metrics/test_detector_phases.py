@@ -36,7 +36,7 @@ def signs(name: str, shape: tuple[int, int]) -> np.ndarray:
     )
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(st.integers(0, 2**20), st.sampled_from(PATTERNS), st.floats(0.005, 0.2), st.booleans())
 def test_a_pattern_is_found_with_its_size(
     seed: int, name: str, difference: float, turns: bool
@@ -50,7 +50,7 @@ def test_a_pattern_is_found_with_its_size(
     assert not any(pattern.significant for other, pattern in patterns.items() if other != name)
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(st.integers(0, 2**20), st.integers(20, 150), st.integers(20, 150))
 def test_noise_has_no_pattern(seed: int, height: int, width: int) -> None:
     image = np.random.default_rng(seed).normal(500, 20, (height, width))

@@ -22,7 +22,7 @@ def positions(image: np.ndarray) -> list[tuple[int, ...]]:
     return [tuple(place) for place in wrong_pixels(np.rint(image).astype(np.float32), 1.0).tolist()]
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(
     seeds,
     st.integers(PATCH_PX, SIDE_PX - PATCH_PX - 1),
@@ -35,7 +35,7 @@ def test_dead_and_hot_pixels_are_found_and_nothing_else(seed: int, row: int, col
         assert positions(image) == [(row, column)]
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(seeds, st.floats(0.6, 2), st.floats(50, 5000), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
 def test_a_star_is_not_a_hot_pixel(
     seed: int, sigma_px: float, peak: float, down_px: float, right_px: float
@@ -47,7 +47,7 @@ def test_a_star_is_not_a_hot_pixel(
     assert positions(np.minimum(image, 4095)) == []
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(seeds, st.floats(0.7, 3), st.floats(0, 60))
 def test_blurred_texture_is_a_scene(seed: int, sigma_px: float, contrast: float) -> None:
     rough = gaussian_filter(

@@ -56,7 +56,7 @@ def test_a_pass_equals_the_simulator(name: str, ratio: int) -> None:
     np.testing.assert_allclose(actual.numpy(), expected, atol=0.5)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.floats(0.02, 3), st.floats(0.05, 1), st.floats(0, 1.5))
 def test_a_look_multiplies_the_mean_and_the_contrast_by_its_factors(
     light: float, contrast: float, softness_px: float

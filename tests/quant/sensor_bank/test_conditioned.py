@@ -38,6 +38,8 @@ from beers_deploy.quant.tiling.receptive_field import tiling_of
 from tests.model.networks import condition_of
 from tests.quant.sensor_bank.test_filters import textured
 
+TEXTURE = 0.3 + 0.3 * textured(46, 58, 9)
+"""An image that stays within eight units of the quietest sensor, where INT8 ends."""
 SENSORS = [
     (0.2, 0.1, -0.3, -0.2),
     (-0.9, -0.8, 0.4, 0.5),
@@ -74,6 +76,11 @@ def pair(request: pytest.FixtureRequest) -> "Pair":
     return float_network, quantize_behind_bank(weights_of(float_network), middle, images)
 
 
+@pytest.fixture
+def conditioned(pair: "Pair") -> ConditionedCore:
+    return pair[1]
+
+
 Pair = tuple[BankedConvBEERS, ConditionedCore]
 Image = np.ndarray
 
@@ -107,12 +114,10 @@ def test_int8_is_near_the_float_network_for_every_sensor(
     pair: Pair, vector: tuple[float, ...]
 ) -> None:
     float_network, conditioned = pair
-    # The texture stays within eight units of the quietest sensor, where INT8 ends.
-    image = 0.3 + 0.3 * textured(46, 58, 9)
-    expected = in_float(float_network, vector, image)
+    expected = in_float(float_network, vector, TEXTURE)
     unit = bank_of_vector(vector).unit
-    assert rms(in_int8(conditioned, vector, image) - expected) < 0.05 * unit
-    assert rms(image - expected) > 0.1 * unit
+    assert rms(in_int8(conditioned, vector, TEXTURE) - expected) < 0.05 * unit
+    assert rms(TEXTURE - expected) > 0.1 * unit
 
 
 @pytest.mark.parametrize("vector", SENSORS)
@@ -139,17 +144,17 @@ def test_a_float_network_with_the_rounding_of_its_file_errs_as_the_file_does(
     pair: Pair, vector: tuple[float, ...]
 ) -> None:
     float_network, conditioned = pair
-    image = 0.3 + 0.3 * textured(46, 58, 9)
+    image = torch.from_numpy(TEXTURE)
     condition = condition_of(torch.tensor([vector]))
     stream, *inner = (
         torch.from_numpy(values)[:, None, None]
         for values in map_steps(conditioned, weights_of(float_network))
     )
     with torch.inference_mode():
-        plain = float_network(torch.from_numpy(image), condition)
+        plain = float_network(image, condition)
         steps = Rounding(stream, tuple(inner)).steps(condition.gains)
-        rounded = float_network(torch.from_numpy(image), condition, steps=steps)
-    error = in_int8(conditioned, vector, image) - in_float(float_network, vector, image)
+        rounded = float_network(image, condition, steps=steps)
+    error = in_int8(conditioned, vector, TEXTURE) - in_float(float_network, vector, TEXTURE)
     ratio = np.linalg.norm((rounded - plain).numpy()) / np.linalg.norm(error)
     # Only the file rounds weights, the bank and the last sum, so the ratio is not 1.
     assert 0.4 < ratio < 1.1
@@ -177,10 +182,8 @@ def test_the_steps_of_maps_turn_float_weights_into_those_of_the_file(
         assert np.sqrt(np.square(op.weight - expected).mean()) < 1
 
 
-def test_the_file_matches_its_integers_and_the_reference(
-    pair: Pair,
-) -> None:
-    core = core_of(pair[1], SENSORS[0])
+def test_the_file_matches_its_integers_and_the_reference(conditioned: ConditionedCore) -> None:
+    core = core_of(conditioned, SENSORS[0])
     image = textured(30, 34, 5)
     file = host_model(core, {"precision": "int8 legal"})
     assert encoding_faults(file) == []
@@ -192,9 +195,9 @@ def test_the_file_matches_its_integers_and_the_reference(
 
 
 def test_a_sensor_changes_the_first_layer_biases_and_the_unit_alone(
-    pair: Pair,
+    conditioned: ConditionedCore,
 ) -> None:
-    first, second = (core_of(pair[1], vector) for vector in SENSORS[:2])
+    first, second = (core_of(conditioned, vector) for vector in SENSORS[:2])
     assert first.frac_bits == second.frac_bits
     assert first.host_part.unit != second.host_part.unit
     for one, other in zip(first.ops, second.ops, strict=True):
@@ -209,9 +212,7 @@ def test_a_sensor_changes_the_first_layer_biases_and_the_unit_alone(
 
 @pytest.mark.parametrize("vector", SENSORS)
 def test_a_body_with_a_gain_computes_the_same_as_with_a_gain_of_one(
-    pair: Pair,
-    vector: tuple[float, ...],
-    monkeypatch: pytest.MonkeyPatch,
+    conditioned: ConditionedCore, vector: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Image, filters and biases agree on the gain, so that results differ by rounding alone.
 
@@ -219,9 +220,9 @@ def test_a_body_with_a_gain_computes_the_same_as_with_a_gain_of_one(
     """
     image = 0.4 + 0.02 * textured(46, 58, 3)
     bank = bank_of_vector(vector)
-    own = in_int8(pair[1], vector, image)
+    own = in_int8(conditioned, vector, image)
     monkeypatch.setattr("beers_deploy.model.bank.GAINS", (1.0, 1.0))
-    assert rms(own - in_int8(pair[1], vector, image)) < 0.05 * bank.unit
+    assert rms(own - in_int8(conditioned, vector, image)) < 0.05 * bank.unit
     assert bank.gain == 1
 
 
@@ -246,9 +247,8 @@ def test_a_dark_image_that_was_multiplied_is_restored_with_smaller_steps(
     assert rms((restored - expected)[inner]) < 0.75 * coarse
 
 
-def test_any_sensors_file_becomes_another_to_the_byte(pair: Pair) -> None:
+def test_any_sensors_file_becomes_another_to_the_byte(conditioned: ConditionedCore) -> None:
     """The biases in its metadata suffice for this, and so does a delta."""
-    conditioned = pair[1]
     first, second = (file_of(conditioned, vector) for vector in SENSORS[:2])
     stored = required_conditioned_core(first)
     expected = second.SerializeToString(deterministic=True)
@@ -264,18 +264,18 @@ def test_any_sensors_file_becomes_another_to_the_byte(pair: Pair) -> None:
     "change", [lambda d: d[:-9], lambda d: d[:0], lambda d: b"x" + d, lambda d: d[:40] + d[41:]]
 )
 def test_a_damaged_delta_and_one_of_another_network_are_refused(
-    pair: Pair, change: Callable[[bytes], bytes]
+    conditioned: ConditionedCore, change: Callable[[bytes], bytes]
 ) -> None:
-    core = core_of(pair[1], SENSORS[1])
-    delta = delta_of_file(file_of(pair[1], SENSORS[1]))
+    core = core_of(conditioned, SENSORS[1])
+    delta = delta_of_file(file_of(conditioned, SENSORS[1]))
     for other, content in ((core, change(delta)), (replace(core, ops=core.ops[1:]), delta)):
         with pytest.raises(ModelError, match=r"^The delta is damaged or .*network \(.*--delta"):
             with_delta(other, content)
 
 
-def test_a_delta_does_not_fit_a_network_of_the_same_layers(pair: Pair) -> None:
-    core = core_of(pair[1], SENSORS[1])
-    delta = delta_of_file(file_of(pair[1], SENSORS[1]))
+def test_a_delta_does_not_fit_a_network_of_the_same_layers(conditioned: ConditionedCore) -> None:
+    core = core_of(conditioned, SENSORS[1])
+    delta = delta_of_file(file_of(conditioned, SENSORS[1]))
     last = next(op for op in reversed(core.ops) if isinstance(op, IntConv))
     other = replace(last, weight=last.weight[::-1].copy())
     ops = tuple(other if op is last else op for op in core.ops)
@@ -283,10 +283,8 @@ def test_a_delta_does_not_fit_a_network_of_the_same_layers(pair: Pair) -> None:
         with_delta(replace(core, ops=ops), delta)
 
 
-def test_biases_of_another_network_are_refused(
-    pair: Pair,
-) -> None:
-    core = core_of(pair[1], SENSORS[0])
+def test_biases_of_another_network_are_refused(conditioned: ConditionedCore) -> None:
+    core = core_of(conditioned, SENSORS[0])
     with pytest.raises(ModelError, match="cannot be conditioned"):
         required_conditioned_core(host_model(core, {}))
     for words in ("[]", '{"head": [[0, 0, 0, 0, 0]]}', '{"other": []}', "{"):
@@ -312,8 +310,8 @@ def test_tiles_give_the_whole_images_result(pair: Pair) -> None:
         np.testing.assert_array_equal(tile[..., :32, :32], expected)
 
 
-def test_no_image_leaves_the_bounds_that_are_proven(pair: Pair) -> None:
-    core = core_of(pair[1], SENSORS[3])
+def test_no_image_leaves_the_bounds_that_are_proven(conditioned: ConditionedCore) -> None:
+    core = core_of(conditioned, SENSORS[3])
     bounds = {bound.name: bound for bound in layer_bounds(core)}
     checkerboard = (np.indices((24, 28)).sum(0) % 2).astype(np.float32)[None, None]
     for image in (checkerboard, textured(24, 28, 4), np.ones_like(checkerboard)):

@@ -58,7 +58,7 @@ PARTS = (
 """Operators on a channels-last tensor; the braces stand for its name."""
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.lists(st.sampled_from(PARTS), max_size=4), st.booleans())
 def test_channels_that_are_last_between_other_layers_become_first(
     parts: list[str], image_last: bool

@@ -68,7 +68,7 @@ PARTS = {
 """Operators on one tensor; the braces stand for its name."""
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(st.sampled_from(sorted(PARTS)), min_size=2, max_size=4))
 def test_channelwise_operators_are_folded_into_convolutions(parts: list[str]) -> None:
     tensors = ["x", *(f"t{k}" for k in range(1, len(parts))), "y"]

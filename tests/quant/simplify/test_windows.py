@@ -44,7 +44,7 @@ def pairs(low: int, high: int) -> st.SearchStrategy[tuple[int, int]]:
     return st.tuples(sides, sides)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     kernel=pairs(1, 16),
     pads=st.lists(st.integers(0, 8), min_size=4, max_size=4),
@@ -104,7 +104,7 @@ def test_srresnets_kernels_of_9_x_9_are_two_and_a_sum() -> None:
     assert_same(model, short, 9, 11)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     border=pairs(0, 6),
     size=pairs(16, 22),

@@ -62,7 +62,7 @@ def test_the_profile_is_that_of_the_sensor(raw: tuple[Path, Path], tmp_path: Pat
     figures = tmp_path / "mine.json"
     options = "--bits", 12, "--gain", GAIN, "--gsd", 0.7
     done("characterize", *raw, *options, "--out", out, "--json", figures)
-    profile = Sensor.load(str(out))
+    profile = Sensor.load(out)
     sensor = profile.nominal()
     assert sensor.response is not None
     none = np.zeros((1, 1))
@@ -133,11 +133,11 @@ def test_without_an_edge_the_mtf_is_assumed_and_marked_so(tmp_path: Path) -> Non
     ramp = np.linspace(200, 3000, 320)[:, None] + np.random.default_rng(1).normal(0, 20, (320, 320))
     command = "characterize", tiff(tmp_path, ramp.astype(np.uint16)), "--bits", 12, "--out", out
     assert "the profile's MTF is an assumption" in done(*command)
-    profile = Sensor.load(str(out))
+    profile = Sensor.load(out)
     assert profile.mtf_nyquist.status == "assumed"
     assert profile.snr_pair[1].status == "measured"
     assert "assumption" not in done(*command, "--mtf", "0.08,0.04", "--overwrite")
-    profile = Sensor.load(str(out))
+    profile = Sensor.load(out)
     assert profile.nominal().mtf_axes == (0.08, 0.04)
     assert profile.mtf_nyquist.status == "stated"
 
@@ -322,5 +322,5 @@ def test_the_noise_of_a_bound_is_a_profile_that_loads(
         (tmp_path / "mine.toml").write_text(
             profile_toml(replace(result, snrs=snrs)), encoding="utf-8"
         )
-        sensor = Sensor.load(str(tmp_path / "mine.toml")).nominal()
+        sensor = Sensor.load(tmp_path / "mine.toml").nominal()
         assert min(sensor.alpha, sensor.beta) >= 0
