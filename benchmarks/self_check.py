@@ -42,6 +42,7 @@ CLASSES = (0, 10, 20, 30, 40, 60, 100, np.inf)
 LOSSES_DB = (COSTLY_DB, 1, 2, 5, np.inf)
 """The limits of the classes of a block's loss."""
 PEAK_DN = 4095
+SEED = 0
 KNOWN = np.random.default_rng(0).random((64, 64), np.float32) * PEAK_DN
 """The drawn tile, whose restoration must not change."""
 
@@ -62,10 +63,10 @@ def restorer(name: str, sensor: Instrument) -> Restore:
     return network_restore(Network.load(name, sensor=profile), profile, REFERENCE, BOTH)
 
 
-def pairs_at(images: Path, sensor: Instrument, radiance: float, seed: int) -> list[NamedPair]:
+def pairs_at(images: Path, sensor: Instrument, radiance: float = 1.0) -> list[NamedPair]:
     """Simulate acquisitions of the images."""
-    scenes = scenes_at(radiance, load_scenes(images, REFERENCE, seed))
-    return simulate_pairs(scenes, sensor, REFERENCE.in_units_of(sensor), seed)[0]
+    scenes = scenes_at(radiance, load_scenes(images, REFERENCE, SEED))
+    return simulate_pairs(scenes, sensor, REFERENCE.in_units_of(sensor), SEED)[0]
 
 
 def flat(parts: list[Judged]) -> Judged:
@@ -93,7 +94,7 @@ def shares(outside: np.ndarray, values: np.ndarray, limits: tuple[float, ...]) -
     return ", ".join(words)
 
 
-def right(images: Path, names: list[str], seed: int, *, sweep: bool) -> Iterator[str]:
+def right(images: Path, names: list[str], *, sweep: bool) -> Iterator[str]:
     """Yield a line for each network: the blocks of correct restorations that are flagged."""
     instrument = NOMINAL.nominal()
     cases = [(instrument, radiance) for radiance in RADIANCES]
@@ -105,7 +106,7 @@ def right(images: Path, names: list[str], seed: int, *, sweep: bool) -> Iterator
         for sensor, radiance in cases:
             check = SelfCheck.of(sensor, REFERENCE.in_units_of(sensor))
             restore = restorer(name, sensor)
-            raws = [pair.degraded for pair in pairs_at(images, sensor, radiance, seed)]
+            raws = [pair.degraded for pair in pairs_at(images, sensor, radiance)]
             parts += [judged(check, raw, restore(raw)) for raw in raws]
         blocks = flat(parts)
         yield (
@@ -115,11 +116,11 @@ def right(images: Path, names: list[str], seed: int, *, sweep: bool) -> Iterator
         )
 
 
-def wrong(images: Path, names: list[str], seed: int) -> Iterator[str]:
+def wrong(images: Path, names: list[str]) -> Iterator[str]:
     """Yield a line for each network and wrong MTF: the share that is found, by sharpening."""
     sensor = NOMINAL.nominal()
     check = SelfCheck.of(sensor, REFERENCE.in_units_of(sensor))
-    pairs = pairs_at(images, sensor, 1.0, seed)
+    pairs = pairs_at(images, sensor)
     for name in names:
         for factor in WRONG:
             restore = restorer(name, replace(sensor, mtf_nyquist=factor * sensor.mtf_nyquist))
@@ -135,14 +136,14 @@ def block_db(restored: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.asarray(10 * np.log10(PEAK_DN**2 / blocks.mean(axis=(1, 3))))
 
 
-def flips(images: Path, name: str, count: int, seed: int) -> str:
+def flips(images: Path, name: str, count: int) -> str:
     """Return a line: the share that is found of the flips that cost a block too much."""
     sensor = NOMINAL.nominal()
     reference = REFERENCE.in_units_of(sensor)
     check = SelfCheck.of(sensor, reference)
     network = Network.load(name, sensor=profile_of(sensor, NOMINAL))
     core = read_core(network.model)
-    pairs = pairs_at(images, sensor, 1.0, seed)
+    pairs = pairs_at(images, sensor)
     sound = network_method(network.model, PEAK_DN, {}, sensor, reference)
     known = sound(KNOWN)
     hurt_blocks = []
@@ -153,7 +154,7 @@ def flips(images: Path, name: str, count: int, seed: int) -> str:
     costly_other_tiles = 0
     before: dict[int, np.ndarray] = {}
     for draw in range(count):
-        generator = np.random.default_rng([seed, draw])
+        generator = np.random.default_rng([SEED, draw])
         model = host_model(flip_weights(core, 1, generator), {})
         number = draw % len(pairs)
         pair = pairs[number]
@@ -197,15 +198,14 @@ def main() -> None:
     parser.add_argument("--networks", default="convbeers-xs,convbeers-xs-int8,convbeers-s-int8")
     parser.add_argument("--flips", type=int, default=200, help="0 to skip the third table")
     parser.add_argument("--sweep", action="store_true")
-    parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     names = arguments.networks.split(",")
-    for line in wrong(arguments.images, names, arguments.seed):
+    for line in wrong(arguments.images, names):
         print(line, flush=True)
     for name in names:
         if arguments.flips and name.endswith("-int8"):
-            print(flips(arguments.images, name, arguments.flips, arguments.seed), flush=True)
-    for line in right(arguments.images, names, arguments.seed, sweep=arguments.sweep):
+            print(flips(arguments.images, name, arguments.flips), flush=True)
+    for line in right(arguments.images, names, sweep=arguments.sweep):
         print(line, flush=True)
 
 

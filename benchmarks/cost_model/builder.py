@@ -55,7 +55,6 @@ class Builder:
         stride: Size = 1,
         *,
         d: int = 1,
-        g: int = 1,
         valid: int = 0,
     ) -> Tensor:
         """Append a convolution.
@@ -66,13 +65,11 @@ class Builder:
             kernel: its size in pixels.
             stride: in pixels.
             d: dilation.
-            g: the number of groups of channels.
             valid: pads nothing if 1; otherwise the result has size / stride, rounded up.
         """
         sides, window, size = _slide(x.shape, kernel, stride, valid, d)
-        weights = channels * (x.channels // g) * math.prod(sides)
-        kind: Kind = "grouped conv" if g > 1 else "conv"
-        return self._append("Conv", kind, (x,), (channels, *size), sides, window, weights)
+        weights = channels * x.channels * math.prod(sides)
+        return self._append("Conv", "conv", (x,), (channels, *size), sides, window, weights)
 
     def depthwise(
         self, x: Tensor, kernel: Size = 3, stride: Size = 1, *, d: int = 1, m: int = 1
@@ -127,23 +124,12 @@ class Builder:
             x = self._append("Add", "add", (x, other), x.shape)
         return x
 
-    def mul(self, x: Tensor, other: Tensor) -> Tensor:
-        """Append the product of two results of one shape, or of each channel with a number."""
-        per_channel = other.shape[1:] == (1, 1)
-        _require_same(x.shape, (other.channels, *x.shape[1:]) if per_channel else other.shape)
-        return self._append("Mul", "mul", (x, other), x.shape)
-
     def concat(self, x: Tensor, *others: Tensor) -> Tensor:
         """Append a concatenation of channels."""
         for other in others:
             _require_same(x.shape[1:], other.shape[1:])
         channels = x.channels + sum(other.channels for other in others)
         return self._append("Concat", "concat", (x, *others), (channels, *x.shape[1:]))
-
-    def slice(self, x: Tensor, first: int, count: int) -> Tensor:
-        """Append a slice of `count` channels from `first` on, counted from 0."""
-        _require_same((min(first + count, x.channels),), (first + count,))
-        return self._append("Slice", "other", (x,), (count, *x.shape[1:]))
 
     def resize(self, x: Tensor, to: int | Tensor = 2, *, linear: bool = False) -> Tensor:
         """Append a resize by an integer factor, or to the size of another result: nearest
@@ -167,10 +153,6 @@ class Builder:
         """Append the inverse of a pixel shuffle (`reorg` of YOLOv2, Focus of YOLOX)."""
         shape = (x.channels * block**2, x.shape[1] // block, x.shape[2] // block)
         return self._append("SpaceToDepth", "pixel shuffle", (x,), shape)
-
-    def activation(self, x: Tensor, op_type: str) -> Tensor:
-        """Append an activation that is not fused into a convolution."""
-        return self._append(op_type, "activation", (x,), x.shape)
 
     def out(self, x: Tensor, channels: int | None = None) -> Tensor:
         """Make a result one of the network's; the host reads `channels` of it,

@@ -24,8 +24,8 @@ channels. A number may be a sum, difference, product or exact quotient of number
 block may also stand for a kept result. In a block, x is what the block was called on, and its last
 x is what it returns.
 
-    conv C [K=3 [S=1]] [d=1] [g=1] [valid]    convolution into C channels: kernel, stride,
-                                              dilation, groups
+    conv C [K=3 [S=1]] [d=1] [valid]          convolution into C channels: kernel, stride,
+                                              dilation
     dw [K=3 [S=1]] [d=1] [m=1]                depthwise, into m times the channels
     transposed C K S                          transposed convolution, S times as large
     fc C                                      fully connected
@@ -37,9 +37,6 @@ x is what it returns.
     bilinear [N=2|NAME]                       the same, bilinear instead of nearest neighbour
     shuffle [N=2]    unshuffle [N=2]          channels to N x N pixels and back
     add NAME...      concat NAME...           joins the result so far with kept ones
-    mul NAME                                  the same, a product
-    slice FIRST COUNT                         some of the channels
-    hsigmoid         hswish                   an activation that is a step of its own
     out [CHANNELS]                            a result, of which the host reads so many channels
 
 Sizes are divided by a stride and rounded up, unless `valid` (no padding) or `ceil` (no padding
@@ -72,11 +69,7 @@ STEPS: Mapping[str, Callable[..., Tensor]] = {
     "shuffle": Builder.shuffle,
     "unshuffle": Builder.unshuffle,
     "add": Builder.add,
-    "mul": Builder.mul,
     "concat": Builder.concat,
-    "slice": Builder.slice,
-    "hsigmoid": lambda builder, x: builder.activation(x, "HardSigmoid"),
-    "hswish": lambda builder, x: builder.activation(x, "HardSwish"),
     "out": Builder.out,
 }
 KINDS = {

@@ -101,7 +101,7 @@ def labelled(folder: Path, count: int) -> Path:
     full_scale = Sensor.load("pleiades-reference").nominal()
     folder.mkdir()
     for number in range(count):
-        scene = synthetic_labelled(number, 0)
+        scene = synthetic_labelled(number)
         picture = Stretch(0, 4095 / full_scale.gain_dn_per_radiance).to_srgb(
             scene.radiance(full_scale)
         )
