@@ -28,12 +28,12 @@ from beers_deploy.quant.onnx_file import GraphWriter, make_model
 from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.samples.simulated import draw_patches
-from beers_deploy.quant.session import open_session, planes_of
+from beers_deploy.quant.session import open_session, planes_of, result_of
 
 
-def image(height: int = 37, width: int = 53, seed: int = 0) -> np.ndarray:
-    """Return noise of digital numbers of 12 bits, (1, 1, height, width) float32 in [0, 1]."""
-    dn = np.random.default_rng(seed).integers(0, 4096, (1, 1, height, width))
+def image(height: int = 37, width: int = 53, seed: int = 0, channels: int = 1) -> np.ndarray:
+    """Return noise of digital numbers of 12 bits, (1, C, height, width) float32 in [0, 1]."""
+    dn = np.random.default_rng(seed).integers(0, 4096, (1, channels, height, width))
     return dn.astype(np.float32) / np.float32(4095)
 
 
@@ -83,6 +83,23 @@ def in_float(
     """Run a float graph that reads planes, and return its correction or another tensor."""
     session = open_session(graph_to_onnx(graph, [name], host_part.planes))
     return np.asarray(session.run(None, {PLANES: planes_of(image, host_part)})[0])
+
+
+def run_model(model: onnx.ModelProto, image: np.ndarray) -> np.ndarray:
+    """Return the result of a model for an image, of whatever shape it is."""
+    return result_of(open_session(model), image)
+
+
+def assert_same(
+    model: onnx.ModelProto,
+    other: onnx.ModelProto,
+    image: np.ndarray,
+    rtol: float = 0.0,
+    atol: float = 0.0,
+) -> None:
+    """Check that two models compute the same from an image, exactly if no tolerance is given."""
+    expected = run_model(model, image)
+    np.testing.assert_allclose(run_model(other, image), expected, rtol=rtol, atol=atol)
 
 
 def behind_conv(write: Callable[[GraphWriter], object]) -> onnx.ModelProto:

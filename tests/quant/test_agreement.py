@@ -23,7 +23,7 @@ def test_every_layer_of_a_new_file_is_equal(quantized: Quantized) -> None:
     assert {layer.unequal for layer in layers} == {0.0}
 
 
-@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*-int8-*.onnx")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*-int8.onnx")), ids=lambda path: path.stem)
 def test_every_layer_of_a_shipped_file_is_equal(path: Path) -> None:
     model = load_onnx(path)
     core = read_core(model)
@@ -55,7 +55,3 @@ def test_changes_by_the_rounding_rule_are_counted(quantized: Quantized) -> None:
     np.testing.assert_array_equal(layers.up, merged_correction(quantized.core, up))
     np.testing.assert_array_equal(layers.even, merged_correction(quantized.core, even))
     assert max(layer.moved for layer in layers.layers) > 0
-    # The first layer differs at its ties alone, one unit up; later layers carry that on.
-    first = layers.layers[0]
-    assert 0 < first.moved <= first.report.ties
-    assert set(np.unique(up["head"] - even["head"])) == {0, 1}

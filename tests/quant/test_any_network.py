@@ -26,20 +26,19 @@ from beers_deploy.quant.onnx.image_input import image_info
 from beers_deploy.quant.onnx_file import GraphWriter, make_model
 from beers_deploy.quant.passes.selection import Passes
 from beers_deploy.quant.quantize import Quantized, quantize_model
-from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.simplify import simplify
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from examples.networks import NETWORKS, build, to_onnx
-from tests.quant.quick import copied, patches_of, quickly
+from tests.quant.quick import copied, patches_of, quickly, run_model
 from tests.quant.tiling.small_networks import check_tiles
 from tests.quant.trained import assert_equals_reference, moved
 
 SIDE_PX = 48
+EACH = pytest.mark.parametrize("name", NETWORKS)
 
 
-def images(name: str, count: int = 3, side_px: int = SIDE_PX) -> list[np.ndarray]:
+def images(name: str, count: int = 3, side: int = SIDE_PX) -> list[np.ndarray]:
     """Return smooth patches with an edge, (1, C, h, w) float32 in [0, 1], for a network."""
-    side = side_px
     generator = np.random.default_rng(7)
     rows, columns = np.mgrid[:side, :side] / side
     patches = []
@@ -64,33 +63,33 @@ def quantized(name: str) -> Quantized:
     return quickly(float_network(name), patches_of(images(name)))
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@EACH
 def test_int8_stays_near_float(name: str) -> None:
     int8 = quantized(name)
     image = images(name)[1]
-    expected = int8.core.host_part.clip(result_of(open_session(float_network(name)), image))
-    actual = result_of(open_session(int8.host), image)
+    expected = int8.core.host_part.clip(run_model(float_network(name), image))
+    actual = run_model(int8.host, image)
     assert actual.shape == expected.shape
     assert np.abs(actual - expected).mean() < 0.15 * max(float(expected.std()), 0.05)
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@EACH
 def test_the_integer_reference_equals_the_runtime_bit_for_bit(name: str) -> None:
     int8 = quantized(name)
     image = images(name)[2]
     layers = agreement(int8.core, int8.host, image)
     assert [layer.report.name for layer in layers.layers if layer.unequal] == []
-    result = result_of(open_session(int8.host), image)
+    result = run_model(int8.host, image)
     np.testing.assert_array_equal(int8.core.host_part.finish(image, layers.even), result)
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@EACH
 def test_training_computes_the_integers_of_the_reference(name: str) -> None:
     int8 = quantized(name)
     assert_equals_reference(moved(int8.core), int8.core.host_part.encode(images(name, 4)[3]))
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@EACH
 def test_no_image_leaves_the_proven_bounds(name: str) -> None:
     core = quantized(name).core
     tensors, reports = run_core(core, core.host_part.encode(np.round(images(name)[0])))
@@ -100,7 +99,7 @@ def test_no_image_leaves_the_proven_bounds(name: str) -> None:
         assert report.peak_bits <= report.proven_bits, op.name
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@EACH
 def test_a_file_is_read_back_as_the_core_it_was_written_from(name: str) -> None:
     int8 = quantized(name)
     core = read_core(int8.host)
@@ -154,14 +153,14 @@ def test_an_invalid_description_raises_no_other_error(
         as_on_board(corrupted)
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@EACH
 def test_the_core_is_legal_on_the_dpu(name: str) -> None:
     dpu = load_dpu("vck190", None)
     for file in (quantized(name).host, board_model(quantized(name).core, {})):
         assert legality(place(network_of(file, 64), dpu)).passed
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@EACH
 def test_tiles_of_int8_give_the_whole(name: str) -> None:
     model = quantized(name).host
     alignment_px = tiling_of(model).alignment_px
@@ -191,8 +190,8 @@ def test_windows_make_a_result_finer_than_8_bits(weight: float, bias: float) -> 
     errors = []
     for dual in (True, False):
         int8 = quantize_model(model, patches, {}, passes=Passes(dual_range=dual))
-        expected = result_of(open_session(model), image_list[0])
-        actual = result_of(open_session(int8.host), image_list[0])
+        expected = run_model(model, image_list[0])
+        actual = run_model(int8.host, image_list[0])
         # The rounding of the one weight and bias is the same in both, and is left out.
         line = np.polynomial.Polynomial.fit(expected.ravel(), actual.ravel(), 1)
         errors.append(float((actual - line(expected)).std()))

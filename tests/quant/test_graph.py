@@ -21,8 +21,7 @@ from beers_deploy.quant.graph import (
 from beers_deploy.quant.host_part import IMAGE_SLICES
 from beers_deploy.quant.onnx.image_input import image_info
 from beers_deploy.quant.onnx_file import GraphWriter, make_model
-from beers_deploy.quant.session import open_session, result_of
-from tests.quant.quick import behind_conv, copied
+from tests.quant.quick import behind_conv, copied, run_model
 
 
 def test_no_digital_number_is_lost_in_planes_nor_wrapped() -> None:
@@ -123,7 +122,7 @@ def test_a_nearest_resize_is_accepted_where_it_makes_blocks(
 
     model = behind_conv(write)
     pixels = np.random.default_rng(0).random((1, 1, 5, 7), np.float32)
-    result = result_of(open_session(model), pixels)[:, :1]
+    result = run_model(model, pixels)[:, :1]
     # With aligned corners the positions depend on the image's size, so a match proves nothing.
     if where != "align_corners" and np.array_equal(
         result, pixels.repeat(factor, 2).repeat(factor, 3)

@@ -17,9 +17,8 @@ from beers_deploy.quant.host_part import HostPart, Plain
 from beers_deploy.quant.integer.agreement import agreement
 from beers_deploy.quant.onnx.image_input import image_info
 from beers_deploy.quant.onnx_file import GraphWriter, make_model
-from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.simplify import simplify
-from tests.quant.quick import in_float, patches_of, quickly
+from tests.quant.quick import image, in_float, patches_of, quickly, run_model
 from tests.quant.simplify.networks import parsed
 from tests.quant.tiling.small_networks import check_tiles
 
@@ -116,12 +115,6 @@ def float_network(name: str) -> onnx.ModelProto:
     return simplify(parsed(nodes, ends, constants=CONSTANTS), name)
 
 
-def image(height: int, width: int, seed: int = 0) -> np.ndarray:
-    """Draw digital numbers of 12 bits as shares of full scale, (1, 2, height, width)."""
-    dn = np.random.default_rng(seed).integers(0, 4096, (1, 2, height, width))
-    return dn.astype(np.float32) / np.float32(4095)
-
-
 @pytest.mark.parametrize("name", ENDS)
 def test_the_host_takes_the_end_and_nothing_changes_in_float(name: str) -> None:
     network = read_network(float_network(name))
@@ -130,9 +123,9 @@ def test_the_host_takes_the_end_and_nothing_changes_in_float(name: str) -> None:
     assert network.base == base
     assert network.adds_image == adds_image
     part = HostPart.of(network, Plain())
-    raw = image(9, 14)
+    raw = image(9, 14, channels=2)
     correction = in_float(read_planes(network.graph), raw, part)
-    expected = part.clip(result_of(open_session(float_network(name)), raw))
+    expected = part.clip(run_model(float_network(name), raw))
     assert_allclose(part.finish(raw, correction), expected, atol=1e-5)
     # Fine-tuning computes its targets by the inverse, where nothing is clipped.
     part = replace(part, limits=(-9.0, 9.0))
@@ -143,14 +136,14 @@ def test_the_host_takes_the_end_and_nothing_changes_in_float(name: str) -> None:
 
 @pytest.mark.parametrize("name", ENDS)
 def test_int8_files_end_as_the_host_part_does(name: str) -> None:
-    raw = [image(24, 40, seed) for seed in range(3)]
+    raw = [image(24, 40, seed, channels=2) for seed in range(3)]
     int8 = quickly(float_network(name), patches_of(raw[:2]))
     assert encoding_faults(int8.host) == []
     part = int8.core.host_part
     expected = part.finish(raw[2], agreement(int8.core, int8.host, raw[2]).even)
-    restored = result_of(open_session(int8.host), raw[2])
+    restored = run_model(int8.host, raw[2])
     assert_allclose(restored, expected, atol=1e-6)
-    in_float = part.clip(result_of(open_session(float_network(name)), raw[2]))
+    in_float = part.clip(run_model(float_network(name), raw[2]))
     # A sum inside the core has 8 bits.
     assert np.abs(restored - in_float).mean() < 0.01
     check_tiles(int8.host, raw[2], (16, 24))
@@ -161,7 +154,7 @@ def test_int8_files_end_as_the_host_part_does(name: str) -> None:
     [("nearest", 3), *product(("linear", "cubic"), (2, 4))],
 )
 def test_an_enlarged_base_equals_torch_and_the_runtime(mode: Mode, factor: int) -> None:
-    raw = image(7, 11)
+    raw = image(7, 11, channels=2)
     names = {"nearest": "nearest", "linear": "bilinear", "cubic": "bicubic"}
     expected = torch.nn.functional.interpolate(
         torch.from_numpy(raw), scale_factor=factor, mode=names[mode]
@@ -172,4 +165,4 @@ def test_an_enlarged_base_equals_torch_and_the_runtime(mode: Mode, factor: int) 
     writer.node("Identity", "restored", [write_base(writer, base, IMAGE)])
     result = onnx.helper.make_tensor_value_info("restored", onnx.TensorProto.FLOAT, None)
     model = make_model(writer.graph("g", [image_info(IMAGE, 2, None)], [result]), {})
-    assert_allclose(result_of(open_session(model), raw), expected.numpy(), atol=1e-6)
+    assert_allclose(run_model(model, raw), expected.numpy(), atol=1e-6)

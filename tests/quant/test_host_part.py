@@ -59,6 +59,15 @@ def test_a_description_states_the_whole_host_part(part: HostPart) -> None:
         {"front": 3},
         {"margin_px": -1},
         {"input_ranges": [[0, 2], [0, 1]]},
+        {"input_ranges": [[1.0, 0.0]]},
+        {"input_ranges": [[0.0, float("nan")]]},
+        {"input_ranges": [[0.0, 1e9]]},
+        {"input_ranges": [[0.0, 2.0]] * 2},
+        {"input_ranges": [[0.0]]},
+        {"input_ranges": 3},
+        {"limits": [1.0, 0.0]},
+        {"limits": [1.0]},
+        {"limits": [0.0, float("inf")]},
         {"planes": 5},
         {"planes": None},
         {"gains": 0},
@@ -70,6 +79,7 @@ def test_a_description_states_the_whole_host_part(part: HostPart) -> None:
     ],
 )
 def test_a_damaged_description_is_refused(damage: dict[str, Any]) -> None:
+    """Files may come from anybody, so the reader trusts none of their numbers."""
     with pytest.raises((TypeError, ValueError)):
         host_part_from_json(described(HostPart()) | damage)
 

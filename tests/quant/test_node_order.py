@@ -10,8 +10,7 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx.image_input import image_info
 from beers_deploy.quant.onnx.node_order import sort_nodes
 from beers_deploy.quant.onnx_file import GraphWriter, make_model, parse_onnx
-from beers_deploy.quant.session import open_session, result_of
-from tests.quant.quick import copied, image
+from tests.quant.quick import assert_same, copied, image
 
 
 def network() -> onnx.ModelProto:
@@ -36,9 +35,7 @@ def test_nodes_in_any_order_compute_the_same(order: list[int]) -> None:
     mixed.graph.node.extend(nodes)
     read = parse_onnx(mixed.SerializeToString(), "a.onnx")
     onnx.checker.check_model(read)
-    sample = image()
-    expected = result_of(open_session(model), sample)
-    np.testing.assert_array_equal(result_of(open_session(read), sample), expected)
+    assert_same(model, read, image())
 
 
 def test_sorted_nodes_stay_as_they_are() -> None:

@@ -10,7 +10,7 @@ from onnx.reference import ReferenceEvaluator
 
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.quant.graph.pixel_shuffle import MOVES
-from beers_deploy.quant.session import open_session, result_of
+from tests.quant.quick import run_model
 from tests.quant.tiling.small_networks import Row, taps
 
 
@@ -46,7 +46,7 @@ def test_sizes_are_the_runtimes_own(row: Row, side: int) -> None:
     shape = network_of(model, side).operations[0].out_shape
     # A window that is larger than its map has no size.
     assume(shape is not None)
-    result = result_of(open_session(model), np.zeros((1, 1, side, side), np.float32))
+    result = run_model(model, np.zeros((1, 1, side, side), np.float32))
     assert result.shape[1:] == shape
 
 

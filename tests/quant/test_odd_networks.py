@@ -11,9 +11,8 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph import read_network
 from beers_deploy.quant.integer.agreement import agreement
 from beers_deploy.quant.quantize import quantize_model
-from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.structure import saturated_shares, structure_checks
-from tests.quant.quick import patches_of
+from tests.quant.quick import patches_of, run_model
 from tests.quant.simplify.networks import parsed, single
 from tests.quant.trained import assert_equals_reference, moved
 
@@ -230,8 +229,8 @@ def test_int8_is_near_float_equals_the_reference_and_has_no_faults(name: str) ->
     ]
     patches = patches_of(samples)
     int8 = quantize_model(model, patches, {})
-    expected = int8.core.host_part.clip(result_of(open_session(model), samples[1]))
-    actual = result_of(open_session(int8.host), samples[1])
+    expected = int8.core.host_part.clip(run_model(model, samples[1]))
+    actual = run_model(int8.host, samples[1])
     assert np.abs(actual - expected).mean() < 0.06 * expected.std()
     assert not any(layer.unequal for layer in agreement(int8.core, int8.host, samples[2]).layers)
     assert_equals_reference(moved(int8.core), int8.core.host_part.encode(samples[2]))

@@ -47,8 +47,8 @@ from beers_deploy.quant.passes.selection import Passes
 from beers_deploy.quant.passes.trial import Costs, CropTrials
 from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.samples.patches import Patches
-from beers_deploy.quant.session import open_session, result_of
-from tests.quant.quick import image, in_float, quickly
+from beers_deploy.quant.session import open_session
+from tests.quant.quick import image, in_float, quickly, run_model
 from tests.quant.simplify.networks import parsed
 from tests.quant.test_odd_networks import SAME, sketch
 
@@ -293,8 +293,8 @@ def one_scale() -> AbstractContextManager[object]:
 def error_of(quantized: Quantized, model: onnx.ModelProto) -> float:
     """Return the mean error of an INT8 network against the float one, on one image."""
     shown = image(40, 40)
-    expected = result_of(open_session(model), shown)
-    return float(np.abs(result_of(open_session(quantized.host), shown) - expected).mean())
+    expected = run_model(model, shown)
+    return float(np.abs(run_model(quantized.host, shown) - expected).mean())
 
 
 def test_sums_that_grow_by_far_have_scales_of_their_own(patches: Patches) -> None:

@@ -12,10 +12,9 @@ from torch.nn import functional
 
 from beers_deploy.quant.passes.selection import ALL, Passes
 from beers_deploy.quant.quantize import quantize_model
-from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.simplify import simplify
 from examples.networks import DPU_SLOPE, to_onnx
-from tests.quant.quick import patches_of
+from tests.quant.quick import patches_of, run_model
 from tests.quant.test_odd_networks import VALID
 
 pytestmark = pytest.mark.slow
@@ -63,7 +62,7 @@ def results(float_onnx: onnx.ModelProto) -> Results:
     def of_passes(passes: Passes) -> list[np.ndarray]:
         networks = (float_onnx, VALID["dead channels"], distilling)
         files = [quantize_model(network, patches, {}, passes=passes).host for network in networks]
-        return [result_of(open_session(file), waves(0)) for file in files]
+        return [run_model(file, waves(0)) for file in files]
 
     return of_passes
 

@@ -25,11 +25,11 @@ from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.passes.long_skip import split_long_skip
 from beers_deploy.quant.passes.selection import ALL
 from beers_deploy.quant.quantize import Quantized, quantize_model
-from beers_deploy.quant.session import open_session, result_of
+from beers_deploy.quant.session import open_session
 from beers_deploy.quant.simplify.simplify import simplify
 from beers_deploy.quant.structure import saturated_shares
 from examples.networks import to_onnx
-from tests.quant.quick import patches_of, waves
+from tests.quant.quick import patches_of, run_model, waves
 
 FEATURES = 5
 
@@ -143,15 +143,12 @@ def test_int8_errs_less(monkeypatch: pytest.MonkeyPatch) -> None:
         network.tail.weight.sub_(network.tail.weight.mean(1, keepdim=True))
     model = simplify(to_onnx("dncnn", network), "bright")
     *images, held_out = (0.1 + 0.8 * each for each in waves(5))
-    in_float = result_of(open_session(model), held_out)
+    in_float = run_model(model, held_out)
     split, whole = (
         quantize_model(model, patches_of(images), {}, passes=replace(ALL, long_skip=each))
         for each in (True, False)
     )
-    errors = [
-        np.abs(result_of(open_session(int8.host), held_out) - in_float).mean()
-        for int8 in (split, whole)
-    ]
+    errors = [np.abs(run_model(int8.host, held_out) - in_float).mean() for int8 in (split, whole)]
     assert errors[0] < 0.8 * errors[1]
     assert_pixel_is_exact(split)
 

@@ -46,6 +46,7 @@ SENSORS = [
     (0.6, 0.3, 0.8, 0.9),
     (-0.2, -0.4, -0.7, -0.9),
 ]
+EACH_SENSOR = pytest.mark.parametrize("vector", SENSORS)
 
 
 def network(scale: int) -> BankedConvBEERS:
@@ -109,7 +110,7 @@ def rms(values: Image) -> float:
     return float(np.sqrt(np.square(values).mean()))
 
 
-@pytest.mark.parametrize("vector", SENSORS)
+@EACH_SENSOR
 def test_int8_is_near_the_float_network_for_every_sensor(
     pair: Pair, vector: tuple[float, ...]
 ) -> None:
@@ -120,7 +121,7 @@ def test_int8_is_near_the_float_network_for_every_sensor(
     assert rms(TEXTURE - expected) > 0.1 * unit
 
 
-@pytest.mark.parametrize("vector", SENSORS)
+@EACH_SENSOR
 def test_points_and_saturated_edges_are_corrected_as_far_as_in_float(
     pair: Pair, vector: tuple[float, ...]
 ) -> None:
@@ -139,7 +140,7 @@ def test_points_and_saturated_edges_are_corrected_as_far_as_in_float(
     assert np.abs(actual - image).max() > 0.9 * most
 
 
-@pytest.mark.parametrize("vector", SENSORS)
+@EACH_SENSOR
 def test_a_float_network_with_the_rounding_of_its_file_errs_as_the_file_does(
     pair: Pair, vector: tuple[float, ...]
 ) -> None:
@@ -210,7 +211,7 @@ def test_a_sensor_changes_the_first_layer_biases_and_the_unit_alone(
             )
 
 
-@pytest.mark.parametrize("vector", SENSORS)
+@EACH_SENSOR
 def test_a_body_with_a_gain_computes_the_same_as_with_a_gain_of_one(
     conditioned: ConditionedCore, vector: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -227,7 +228,7 @@ def test_a_body_with_a_gain_computes_the_same_as_with_a_gain_of_one(
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.02])
-@pytest.mark.parametrize("vector", SENSORS)
+@EACH_SENSOR
 def test_a_dark_image_that_was_multiplied_is_restored_with_smaller_steps(
     pair: Pair, vector: tuple[float, ...], offset: float
 ) -> None:

@@ -8,8 +8,8 @@ import pytest
 
 from beers_deploy.quant.onnx.image_input import image_info
 from beers_deploy.quant.onnx_file import GraphWriter, make_model
-from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.activations_first import activations_first
+from tests.quant.quick import assert_same
 
 CHANNELS = 8
 IMAGE = np.random.default_rng(0).normal(0, 4, (2, 1, 10, 14)).astype(np.float32)
@@ -71,9 +71,7 @@ def test_an_activation_reaches_its_convolutions(kinds: list[str], activation: st
     before = model.SerializeToString()
     moved = activations_first(model)
     assert model.SerializeToString() == before
-    np.testing.assert_array_equal(
-        result_of(open_session(moved), IMAGE), result_of(open_session(model), IMAGE)
-    )
+    assert_same(model, moved, IMAGE)
     writers = {node.output[0]: node.op_type for node in moved.graph.node}
     reads = [writers[n.input[0]] for n in moved.graph.node if n.op_type == activation]
     if activation == "HardSwish" and "MaxPool" in kinds:

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from onnx.reference import ReferenceEvaluator
 
 from beers_deploy.quant.graph import read_network, refusal
-from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.simplify import simplify
+from tests.quant.quick import assert_same, run_model
 from tests.quant.simplify.networks import CHANNELS, CONV, SAME, network_from
 
 IMAGE = np.random.default_rng(4).uniform(0, 1, (1, CHANNELS, 18, 23)).astype(np.float32)
@@ -39,8 +39,8 @@ def test_a_network_of_channels_last_becomes_one_of_channels_first() -> None:
     assert [n.op_type for n in short.graph.node] == ["Conv"]
     assert short.graph.input[0].type.tensor_type.shape.dim[1].dim_value == CHANNELS
     onnx.checker.check_model(short, full_check=True)
-    before = result_of(open_session(model), np.moveaxis(IMAGE, 1, 3))
-    after = result_of(open_session(short), IMAGE)
+    before = run_model(model, np.moveaxis(IMAGE, 1, 3))
+    after = run_model(short, IMAGE)
     np.testing.assert_allclose(np.moveaxis(after, 1, 3), before, rtol=1e-5)
 
 
@@ -90,8 +90,8 @@ def test_channels_that_are_last_between_other_layers_become_first(
     short = simplify(model, "a.onnx")
     assert "Transpose" not in {n.op_type for n in short.graph.node}
     image = 1 + IMAGE
-    before = result_of(open_session(model), np.moveaxis(image, 1, 3) if image_last else image)
-    np.testing.assert_allclose(result_of(open_session(short), image), before, rtol=1e-4)
+    before = run_model(model, np.moveaxis(image, 1, 3) if image_last else image)
+    np.testing.assert_allclose(run_model(short, image), before, rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_pads_of_channels_last_may_name_their_axes(axes: list[int], pads: list[i
     # onnxruntime moves such a Transpose and leaves the axes as they were, which is wrong, so that
     # ONNX's reference gives the expected result.
     (before,) = ReferenceEvaluator(model).run(None, {"x": IMAGE})
-    np.testing.assert_allclose(result_of(open_session(short), IMAGE), np.asarray(before), rtol=1e-4)
+    np.testing.assert_allclose(run_model(short, IMAGE), np.asarray(before), rtol=1e-4)
 
 
 def test_pads_that_follow_from_an_even_size_are_stated() -> None:
@@ -126,8 +126,7 @@ def test_pads_that_follow_from_an_even_size_are_stated() -> None:
     short = simplify(model, "a.onnx")
     assert refusal(short) == ""
     image = IMAGE[..., :16, :20]
-    before = result_of(open_session(model), image)
-    np.testing.assert_allclose(result_of(open_session(short), image), before, rtol=1e-5)
+    assert_same(model, short, image, rtol=1e-5)
 
 
 @pytest.mark.parametrize("layers", [1, 2, 5])
@@ -141,10 +140,10 @@ def test_the_image_of_a_network_without_padding_is_mirrored(layers: int, is_fixe
     short = simplify(model, "a.onnx")
     assert read_network(short).border_px == layers
     onnx.shape_inference.infer_shapes(short, strict_mode=True)
-    inner = result_of(open_session(short), IMAGE)
+    inner = run_model(short, IMAGE)
     assert inner.shape[2:] == IMAGE.shape[2:]
     inner = inner[:, :, layers:-layers, layers:-layers]
-    np.testing.assert_allclose(inner, result_of(open_session(model), IMAGE), rtol=1e-4)
+    np.testing.assert_allclose(inner, run_model(model, IMAGE), rtol=1e-4)
 
 
 def test_a_network_that_pools_over_the_image_gets_no_border() -> None:
@@ -153,8 +152,7 @@ def test_a_network_that_pools_over_the_image_gets_no_border() -> None:
     model = sized(network_from(nodes), *IMAGE.shape[2:])
     short = simplify(model, "a.onnx")
     assert "Pad" not in {n.op_type for n in short.graph.node}
-    before, after = (result_of(open_session(each), IMAGE) for each in (model, short))
-    np.testing.assert_array_equal(after, before)
+    assert_same(model, short, IMAGE)
 
 
 def test_layers_with_and_without_padding_together_are_refused() -> None:
@@ -183,5 +181,4 @@ def test_slices_side_by_side_are_a_pixel_unshuffle() -> None:
     assert [n.op_type for n in short.graph.node] == ["SpaceToDepth", "Conv"]
     assert len(read_network(short).front) == 1
     image = IMAGE[..., :18, :22]
-    before = result_of(open_session(model), image)
-    np.testing.assert_allclose(result_of(open_session(short), image), before, atol=1e-4)
+    assert_same(model, short, image, atol=1e-4)

@@ -15,11 +15,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from beers_deploy.quant.graph import refusal
-from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.simplify import simplify
+from tests.quant.quick import assert_same, run_model
 from tests.quant.simplify.networks import network_from
 
 FEATURES = 4
+IMAGE = np.random.default_rng(2).uniform(0, 1, (1, 1, 22, 38)).astype(np.float32)
 
 
 class PaddedUNet(nn.Module):
@@ -177,10 +178,7 @@ def test_sizes_are_gone_and_results_are_the_same(make: Callable[[], nn.Module]) 
     left = Counter(node.op_type for node in short.graph.node)
     assert not left.keys() & {"Shape", "Slice", "Split", "Pad", "Expand", "Gather"}
     assert refusal(short) == ""
-    image = np.random.default_rng(2).uniform(0, 1, (1, 1, 22, 38)).astype(np.float32)
-    before = result_of(open_session(model), image)
-    after = result_of(open_session(short), image)
-    np.testing.assert_allclose(after, before, atol=1e-6)
+    assert_same(model, short, IMAGE, atol=1e-6)
 
 
 class Enlarged(nn.Module):
@@ -225,16 +223,12 @@ def test_torchs_newer_exporter_selects_channels_in_another_way(tmp_path: Path) -
     model = onnx.load_model(tmp_path / "a.onnx")
     short = simplify(model, "a.onnx")
     assert refusal(short) == ""
-    before, after = (result_of(open_session(each), image.numpy()) for each in (model, short))
-    np.testing.assert_allclose(after, before, atol=1e-5)
+    assert_same(model, short, image.numpy(), atol=1e-5)
 
 
 def test_an_expand_that_has_an_effect_keeps_it() -> None:
     model = exported(Enlarged())
-    image = np.random.default_rng(2).uniform(0, 1, (1, 1, 22, 38)).astype(np.float32)
-    before = result_of(open_session(model), image)
-    after = result_of(open_session(simplify(model, "a.onnx")), image)
-    np.testing.assert_allclose(after, before, atol=1e-6)
+    assert_same(model, simplify(model, "a.onnx"), IMAGE, atol=1e-6)
 
 
 class Cropped(nn.Module):
@@ -266,7 +260,6 @@ def test_a_rectangle_is_freed_where_it_has_no_effect(nodes: str, is_freed: bool)
     freed = simplify(model, "a.onnx")
     assert (freed.graph.input[0].type.tensor_type.shape.dim[2].dim_value == 0) is is_freed
     image = np.random.default_rng(0).random((1, 4, 8, 12), dtype=np.float32)
-    before, after = (result_of(open_session(each), image) for each in (model, freed))
-    np.testing.assert_array_equal(after, before)
+    assert_same(model, freed, image)
     if is_freed:
-        assert result_of(open_session(freed), image[..., :9]).shape[2:] == (16, 18)
+        assert run_model(freed, image[..., :9]).shape[2:] == (16, 18)

@@ -9,14 +9,13 @@ from hypothesis import strategies as st
 
 from beers_deploy.quant.graph import read_network, refusal
 from beers_deploy.quant.onnx.graph import OnnxGraph
-from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.convolutions import (
     LARGE_POSITIONS,
     MOST_POSITIONS,
     split_large_kernel,
 )
 from beers_deploy.quant.simplify.simplify import simplify
-from tests.quant.quick import copied
+from tests.quant.quick import copied, run_model
 from tests.quant.simplify.networks import network_from
 
 CHANNELS = 3
@@ -32,8 +31,8 @@ def assert_same(model: onnx.ModelProto, short: onnx.ModelProto, rows: int, colum
     """Check that two networks are equal but for the rounding of float32."""
     generator = np.random.default_rng(rows)
     pixels = generator.random((2, CHANNELS, rows, columns), np.float32)
-    before = result_of(open_session(model), pixels)
-    after = result_of(open_session(short), pixels)
+    before = run_model(model, pixels)
+    after = run_model(short, pixels)
     largest = np.abs(before).max()
     np.testing.assert_allclose(after, before, atol=1e-5 * largest)
 
@@ -158,7 +157,7 @@ def test_a_u_net_without_padding_crops_its_skip_and_gets_a_mirrored_border() -> 
     assert refusal(short) == ""
     assert read_network(short).border_px == 6
     pixels = generator.random((1, CHANNELS, 40, 44), np.float32)
-    expected = result_of(open_session(model), pixels)
-    whole = result_of(open_session(short), pixels)
+    expected = run_model(model, pixels)
+    whole = run_model(short, pixels)
     inner = whole[:, :, 6:-6, 6:-6]
     np.testing.assert_allclose(inner, expected, atol=1e-5)
