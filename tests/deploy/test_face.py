@@ -21,6 +21,7 @@ from beers_deploy.model.shipped import shipped_names
 from beers_deploy.profiles.sensor_numbers import numbers_of
 from beers_deploy.profiles.shipped import board_names, sensor_names
 from beers_deploy.results import SCHEMA_PATH
+from tests.deploy.restoration.runs import simulated
 
 SMALL = "convbeers-xs"
 
@@ -55,13 +56,6 @@ def tiny() -> bd.Network:
 @pytest.fixture(scope="module")
 def int8(tiny: bd.Network, samples: np.ndarray) -> bd.Network:
     return bd.quantize(tiny, samples=samples, target="zcu102", progress=False)
-
-
-def simulated(**options: Any) -> bd.Pair:
-    """Simulate one pair: without a folder to write, `simulate` returns one."""
-    made = bd.simulate(**options)
-    assert isinstance(made, bd.Pair)
-    return made
 
 
 @pytest.fixture(scope="module")

@@ -127,4 +127,4 @@ def other_formats(folder: Path) -> None:
     images.write_jp2(folder / "raw.jp2", pixels, NBITS=12)
     images.write_vrt(folder / "mosaic.vrt", pixels)
     images.write_dimap(folder / "DIM_product.XML", pixels)
-    images.write_tiff(folder / "bands.tif", images.digital_numbers())
+    images.write_tiff(folder / "bands.tif")

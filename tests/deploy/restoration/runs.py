@@ -87,12 +87,17 @@ def two_bands(path: Path) -> np.ndarray:
     return band
 
 
+def simulated(**options: Any) -> bd.Pair:
+    """Simulate one pair: without a folder to write, `simulate` returns one."""
+    pair = bd.simulate(**options)
+    assert isinstance(pair, bd.Pair)
+    return pair
+
+
 @cache
 def pair_of_bands() -> bd.Pair:
     """Return a drawn scene of 214 x 214 pixels as `NAME` acquires it."""
-    pair = bd.simulate(sensor=NAME, size=214, seed=3)
-    assert isinstance(pair, bd.Pair)
-    return pair
+    return simulated(sensor=NAME, size=214, seed=3)
 
 
 def begin(image: Path, out: Path, *options: object) -> subprocess.Popen[str]:

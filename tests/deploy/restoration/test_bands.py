@@ -55,7 +55,7 @@ def test_bands_without_names_are_used_by_their_number_or_in_order() -> None:
     ],
 )
 def test_what_does_not_fit_is_refused(sensor: str, words: str, tmp_path: Path) -> None:
-    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
+    image = images.write_tiff(tmp_path / "in.tif")
     network = f"--network convbeers-xs --sensor {sensor}"
     assert words in refused(f"restore {image} {tmp_path}/out.tif {network}")
     assert names(tmp_path) == ["in.tif"]

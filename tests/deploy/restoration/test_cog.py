@@ -56,7 +56,7 @@ def test_a_cog_is_valid_and_equals_the_plain_output(
 
 def test_it_records_what_was_done(tmp_path: Path) -> None:
     int8 = shipped_pair("convbeers-xs")[1]
-    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
+    image = images.write_tiff(tmp_path / "in.tif")
     restore(image, tmp_path / "cog.tif", network=int8, cog=True)
     with rasterio.open(tmp_path / "cog.tif") as file:
         tags = file.tags()
@@ -71,7 +71,7 @@ def test_a_run_that_stops_while_it_writes_can_be_resumed(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = partial(restore, network=model, tile=64, cog=True)
-    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
+    image = images.write_tiff(tmp_path / "in.tif")
     run(image, tmp_path / "expected.tif")
     out = tmp_path / "out.tif"
     out.write_bytes(b"the old one")

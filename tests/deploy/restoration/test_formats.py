@@ -39,7 +39,7 @@ def test_polynomials_bits_and_gains_of_a_dimap_are_kept(
 def test_control_points_names_and_gains_are_kept(model: Path, tmp_path: Path) -> None:
     points = [GroundControlPoint(9 * k * k, 17 * k, k / 3, 45 - k / 7, 0) for k in range(5)]
     place: dict[str, Any] = {"transform": None, "gcps": points, "crs": "EPSG:4326"}
-    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers(), **place)
+    image = images.write_tiff(tmp_path / "in.tif", **place)
     with rasterio.open(image, "r+") as file:
         file.offsets = (-0.5, -0.25)
     restore(image, tmp_path / "out.tif", network=model)
@@ -58,7 +58,7 @@ def test_control_points_names_and_gains_are_kept(model: Path, tmp_path: Path) ->
 def test_a_truncated_jpeg_2000_is_an_error_of_one_line(
     share: float, model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    image = images.write_jp2(tmp_path / "a.jp2", images.digital_numbers())
+    image = images.write_jp2(tmp_path / "a.jp2")
     content = image.read_bytes()
     image.write_bytes(content[: int(share * len(content)) + 50])
     with pytest.raises(ImageError, match=r"^.*a\.jp2.*whole image.*$"):
@@ -68,7 +68,7 @@ def test_a_truncated_jpeg_2000_is_an_error_of_one_line(
 
 
 def test_a_tile_of_the_input_cannot_be_an_output(model: Path, tmp_path: Path) -> None:
-    image = images.write_dimap(tmp_path / "DIM.XML", images.digital_numbers())
+    image = images.write_dimap(tmp_path / "DIM.XML")
     tile = tmp_path / "IMG_R2C1.TIF"
     out = tmp_path / "out.tif"
     before = tile.read_bytes()
@@ -80,7 +80,7 @@ def test_a_tile_of_the_input_cannot_be_an_output(model: Path, tmp_path: Path) ->
 
 
 def test_a_changed_tile_changes_the_fingerprint(tmp_path: Path) -> None:
-    image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers())
+    image = images.write_vrt(tmp_path / "a.vrt")
     with open_raster(image) as source:
         before = fingerprint(source.files)
     images.write_jp2(

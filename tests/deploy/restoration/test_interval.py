@@ -28,20 +28,12 @@ from tests.deploy.restoration.runs import (
     names,
     pair_of_bands,
     stopped_after,
-    two_bands,
 )
 from tests.model.networks import plain
 from tests.quant.quick import one_guess
 
 NETWORK = "convbeers-xs-int8"
 OPTIONS: dict[str, Any] = {"network": NETWORK, "sensor": NAME, "interval": 90}
-
-
-@pytest.fixture(scope="module")
-def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("image") / "raw.tif"
-    two_bands(path)
-    return path
 
 
 def run(image: Path, out: Path, **options: Any) -> bytes:

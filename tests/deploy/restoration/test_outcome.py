@@ -9,6 +9,7 @@ import beers_deploy as bd
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.outcome import Tally
+from tests.deploy.restoration.runs import simulated
 
 SENSOR = Sensor.load("pleiades-degraded")
 
@@ -74,8 +75,7 @@ def test_parts_add_up_to_the_whole() -> None:
 def test_shipped_networks_are_not_doubted(seed: int, light: float, has_sensor: bool) -> None:
     generator = np.random.default_rng(seed)
     radiance = light * procedural_scene(480, 480, generator).radiance
-    pair = bd.simulate(images=radiance.astype(np.float32), sensor=SENSOR, seed=seed)
-    assert isinstance(pair, bd.Pair)
+    pair = simulated(images=radiance.astype(np.float32), sensor=SENSOR, seed=seed)
     tallies: list[Tally] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Tally, "require", lambda self, **_: tallies.append(self))

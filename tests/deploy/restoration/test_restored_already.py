@@ -21,7 +21,7 @@ from beers_deploy.network import Network
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.sensor_check.check import restored_already
 from tests.deploy.command_line import done
-from tests.deploy.restoration.runs import source_of
+from tests.deploy.restoration.runs import simulated, source_of
 
 NETWORK = f"convbeers-xs{INT8}"
 SENSOR = Sensor.load("pleiades-degraded")
@@ -62,19 +62,17 @@ def test_a_raw_image_of_any_sensor_in_range_is_not_reported(
 
 
 def restored() -> np.ndarray:
-    pair = bd.simulate(sensor=SENSOR, size=320)
-    assert isinstance(pair, bd.Pair)
-    return np.asarray(bd.restore(pair.degraded, network=NETWORK))
+    return np.asarray(bd.restore(simulated(sensor=SENSOR, size=320).degraded, network=NETWORK))
+
+
+def smoothed(image: np.ndarray) -> np.ndarray:
+    return np.rint(gaussian_filter(image.astype(np.float64), 1.0)).astype(np.uint16)
 
 
 PROCESSED: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "restored": lambda _: restored(),
-    "smoothed": lambda image: np.rint(gaussian_filter(image.astype(np.float64), 1.0)).astype(
-        np.uint16
-    ),
-    "left-justified": lambda image: (
-        16 * np.rint(gaussian_filter(image.astype(np.float64), 1.0)).astype(np.uint16)
-    ),
+    "smoothed": smoothed,
+    "left-justified": lambda image: 16 * smoothed(image),
 }
 
 
@@ -89,11 +87,11 @@ def test_a_processed_image_is_reported(kind: str) -> None:
 
 def test_bands_are_named_if_not_all_are_reported() -> None:
     image = raw(1)
-    assert "already in band 2, with" in check(np.stack([image, PROCESSED["smoothed"](image)]))
+    assert "already in band 2, with" in check(np.stack([image, smoothed(image)]))
 
 
 def test_an_image_that_cannot_be_judged_is_not_reported(model: Path) -> None:
-    smooth = PROCESSED["smoothed"](raw(1))
+    smooth = smoothed(raw(1))
     # There are too few blocks to judge.
     assert check(smooth[:100, :100]) == ""
     # These are no integers.

@@ -49,6 +49,14 @@ def resume_options(model: Path) -> list[str]:
     return f"--network {model} --tile {TILE_PX} --resume --overwrite".split()
 
 
+def finish(image: Path, out: Path, words: list[str], expected: bytes) -> None:
+    """Run to the end, and check the bytes that are written."""
+    running = begin(image, out, *words)
+    output, _ = running.communicate(timeout=120)
+    assert running.returncode == 0, output
+    assert out.read_bytes() == expected
+
+
 def test_killed_at_random_moments_it_is_resumed_to_the_same_bytes(
     image: Path, model: Path, expected: bytes, tmp_path: Path
 ) -> None:
@@ -64,10 +72,7 @@ def test_killed_at_random_moments_it_is_resumed_to_the_same_bytes(
         running.communicate()
         finished += running.returncode == 0
         assert out.read_bytes() in (b"old", expected)
-    last = begin(image, out, *resume_options(model))
-    output, _ = last.communicate(timeout=120)
-    assert last.returncode == 0, output
-    assert out.read_bytes() == expected
+    finish(image, out, resume_options(model), expected)
     assert list(tmp_path.iterdir()) == [out]
 
 
@@ -139,7 +144,7 @@ def test_killed_among_its_rows_and_at_its_cog_it_is_resumed_to_the_same_bytes(
     model: Path, tmp_path: Path
 ) -> None:
     """The image is an index of several files."""
-    image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers())
+    image = images.write_vrt(tmp_path / "a.vrt")
     out = tmp_path / "out.tif"
     restore(image, tmp_path / "expected.tif", network=model, tile=16, threads=1, cog=True)
     expected = (tmp_path / "expected.tif").read_bytes()
@@ -155,8 +160,5 @@ def test_killed_among_its_rows_and_at_its_cog_it_is_resumed_to_the_same_bytes(
         output, _ = running.communicate()
         assert running.returncode < 0 or (sign == "out.tif" and not running.returncode), output
         assert out.read_bytes() in (b"old", expected)
-    last = begin(image, out, *words)
-    output, _ = last.communicate(timeout=120)
-    assert last.returncode == 0, output
-    assert out.read_bytes() == expected
+    finish(image, out, words, expected)
     assert {path.name for path in tmp_path.iterdir()} == before | {"out.tif"}

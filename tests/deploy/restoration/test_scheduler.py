@@ -149,23 +149,31 @@ def test_a_call_that_kills_its_workers_is_one_sentence() -> None:
         local.wait_for_workers(1, timeout=60)
 
 
-def test_a_scheduler_that_goes_away_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "ANSWER_S", 1)
+@pytest.mark.parametrize(
+    ("limits_s", "leave", "words"),
+    [
+        ({"ANSWER_S": 1}, lambda local: local.close(), "connection to the scheduler .* was lost"),
+        (
+            {"POLL_S": 0.2, "WORKERLESS_S": 0.2},
+            lambda local: local.scale(0),
+            r"no workers for 0\.2 s",
+        ),
+    ],
+    ids=["scheduler", "workers"],
+)
+def test_a_scheduler_or_workers_that_go_away_are_one_sentence(
+    limits_s: dict[str, float],
+    leave: Callable[[Any], object],
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name, limit_s in limits_s.items():
+        monkeypatch.setattr(cluster, name, limit_s)
     with (
         local_cluster(1) as local,
-        pytest.raises(MachineError, match=r"connection to the scheduler .* was lost.*resume"),
+        pytest.raises(MachineError, match=f"{words}.*resume"),
     ):
-        call(local.scheduler_address, time.sleep, 60, meanwhile=local.close)
-
-
-def test_a_scheduler_whose_workers_left_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("POLL_S", "WORKERLESS_S"):
-        monkeypatch.setattr(cluster, name, 0.2)
-    with (
-        local_cluster(1) as local,
-        pytest.raises(MachineError, match=r"no workers for 0\.2 s.*resume"),
-    ):
-        call(local.scheduler_address, time.sleep, 60, meanwhile=lambda: local.scale(0))
+        call(local.scheduler_address, time.sleep, 60, meanwhile=lambda: leave(local))
 
 
 def test_a_wrong_address_and_a_lack_of_workers_are_one_sentence(

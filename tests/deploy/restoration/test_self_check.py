@@ -17,14 +17,7 @@ from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration import run as run_module
 from beers_deploy.verbs.restore import restore
-from tests.deploy.restoration.runs import NAME, TRANSFORM, names, two_bands
-
-
-@pytest.fixture(scope="module")
-def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("image") / "raw.tif"
-    two_bands(path)
-    return path
+from tests.deploy.restoration.runs import NAME, TRANSFORM, names
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from beers_deploy.profiles.response import PointSpread, packed
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.sensor_check.check import SensorCheck, check_source
 from tests.deploy.command_line import done, refused
-from tests.deploy.restoration.runs import source_of
+from tests.deploy.restoration.runs import simulated, source_of
 
 NAME = "pleiades-degraded"
 SENSOR = Sensor.load(NAME)
@@ -23,9 +23,7 @@ SENSOR = Sensor.load(NAME)
 @pytest.fixture(scope="module")
 def raw() -> np.ndarray:
     """Return a raw image (320, 320) of drawn fields and houses."""
-    pair = bd.simulate(sensor=SENSOR, size=320, seed=3)
-    assert isinstance(pair, bd.Pair)
-    return pair.degraded
+    return simulated(sensor=SENSOR, size=320, seed=3).degraded
 
 
 def check(
@@ -78,14 +76,11 @@ def test_a_halo_that_the_profile_states_is_no_contradiction() -> None:
     response = PointSpread(161, 161, 4.0, packed(samples))
     across, along = response.at_nyquist
     sensor = SENSOR.with_fields(response=response, mtf_nyquist=across, mtf_nyquist_along=along)
-    pair = bd.simulate(sensor=sensor, size=320, seed=3)
-    assert isinstance(pair, bd.Pair)
-    result = check(pair.degraded, sensor)
+    result = check(simulated(sensor=sensor, size=320, seed=3).degraded, sensor)
     assert result.warnings == ()
     assert (result.figures["measured MTF across"].value or 0) < 3
     sharper = SENSOR.replace(mtf_nyquist=0.14)
-    other = bd.simulate(sensor=sharper, size=320, seed=3)
-    assert isinstance(other, bd.Pair)
+    other = simulated(sensor=sharper, size=320, seed=3)
     assert "MTF across" in "".join(check(other.degraded, sensor).warnings)
 
 
@@ -143,8 +138,7 @@ def test_commands_warn_and_strict_refuses(raw: np.ndarray, tmp_path: Path) -> No
 
 def test_pairs_are_compared_with_the_sensor_before_an_evaluation(tmp_path: Path) -> None:
     profile = SENSOR.replace(snr_0=25, snr_1=55).save(tmp_path / "wrong.toml")
-    pair = bd.simulate(sensor=SENSOR, size=320, seed=3)
-    pairs = pair.save(tmp_path / "pairs")
+    pairs = simulated(sensor=SENSOR, size=320, seed=3).save(tmp_path / "pairs")
     (pairs / "recipe.json").unlink()
     words = ("evaluate", "--pairs", pairs, "--methods", "degraded")
     assert "contradicts the sensor wrong" in refused(*words, "--sensor", profile, "--strict")

@@ -57,7 +57,7 @@ def restored_item(image: Path, item: Path, options: str) -> dict[str, Any]:
 
 
 def test_an_item_is_valid_and_has_the_place_of_the_image(model: Path, tmp_path: Path) -> None:
-    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
+    image = images.write_tiff(tmp_path / "in.tif")
     content = restored_item(image, tmp_path / "catalogue" / "item.json", f"--network {model}")
     assert content["assets"]["restored"]["href"] == "../out.tif"
     assert "cloud-optimized" in content["assets"]["restored"]["type"]
@@ -71,9 +71,7 @@ def test_an_item_is_valid_and_has_the_place_of_the_image(model: Path, tmp_path: 
 
 
 def test_an_image_without_a_place_has_no_geometry(model: Path, tmp_path: Path) -> None:
-    image = images.write_tiff(
-        tmp_path / "in.tif", images.digital_numbers(), crs=None, transform=None
-    )
+    image = images.write_tiff(tmp_path / "in.tif", crs=None, transform=None)
     content = restored_item(image, tmp_path / "item.json", f"--network {model}")
     assert content["geometry"] is None
     assert "bbox" not in content
@@ -82,7 +80,7 @@ def test_an_image_without_a_place_has_no_geometry(model: Path, tmp_path: Path) -
 def test_an_item_needs_its_package(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
+    image = images.write_tiff(tmp_path / "in.tif")
     command = f"restore {image} {tmp_path}/out.tif --network {model} --cog --stac"
     monkeypatch.setitem(sys.modules, "pystac", None)
     assert "beers-deploy[stac]" in refused(command, tmp_path / "i.json")
@@ -91,7 +89,7 @@ def test_an_item_needs_its_package(
 
 def test_an_item_states_how_the_image_was_restored(tmp_path: Path) -> None:
     """A shipped network is built for the sensor, so it is written. The item has its digest."""
-    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
+    image = images.write_tiff(tmp_path / "in.tif")
     options = "--network convbeers-xs-int8 --sensor pleiades-degraded --self-check"
     content = restored_item(image, tmp_path / "out.json", f"{options} {tmp_path}/blocks.tif")
     about = content["properties"]
@@ -142,7 +140,7 @@ def test_a_network_with_a_file_is_linked_where_it_is(model: Path, tmp_path: Path
     own = tmp_path / "networks" / "1.onnx"
     own.parent.mkdir()
     own.write_bytes(model.read_bytes())
-    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
+    image = images.write_tiff(tmp_path / "in.tif")
     restored_item(image, tmp_path / "items" / "a.json", f"--network {own}")
     network = network_item(tmp_path / "items" / "a-network.json")
     assert network.assets["model"].href == "../networks/1.onnx"

@@ -24,6 +24,10 @@ def digital_numbers(bits: int = 12, bands: int = BANDS) -> np.ndarray:
     )
 
 
+PIXELS = digital_numbers()
+"""What every writer writes if it is given no pixels."""
+
+
 def profile(bands: int = BANDS) -> dict[str, Any]:
     """Return GDAL's profile, with a place on Earth that binary fractions do not represent."""
     place = rasterio.transform.from_origin(3e5 + 1 / 3, 4.8e6 + 1 / 7, 0.7, 0.7)
@@ -60,14 +64,14 @@ def write_mask(image: Path, known: np.ndarray) -> None:
         file.write(np.where(known, 255, 0).astype(np.uint8), 1)
 
 
-def write_tiff(path: Path, pixels: np.ndarray, **options: Any) -> Path:
+def write_tiff(path: Path, pixels: np.ndarray = PIXELS, **options: Any) -> Path:
     """Write a TIFF in tiles."""
     return write(
         path, pixels, "GTiff", tiled=True, blockxsize=TILE_PX, blockysize=TILE_PX, **options
     )
 
 
-def write_jp2(path: Path, pixels: np.ndarray, **options: Any) -> Path:
+def write_jp2(path: Path, pixels: np.ndarray = PIXELS, **options: Any) -> Path:
     """Write a lossless JPEG 2000 in tiles."""
     lossless = {"QUALITY": "100", "REVERSIBLE": "YES", "BLOCKXSIZE": TILE_PX, "BLOCKYSIZE": TILE_PX}
     return write(path, pixels, "JP2OpenJPEG", **lossless, **options)
@@ -104,7 +108,7 @@ def quarters(folder: Path, pixels: np.ndarray) -> list[tuple[str, int, int, int,
     return tiles
 
 
-def write_vrt(path: Path, pixels: np.ndarray, more: str = "") -> Path:
+def write_vrt(path: Path, pixels: np.ndarray = PIXELS, more: str = "") -> Path:
     """Write a mosaic, with its four tiles next to it."""
     bands, height, width = pixels.shape
     tiles = quarters(path.parent, pixels)
@@ -136,7 +140,7 @@ def source(name: str, band: int, row: int, column: int, rows: int, columns: int)
     )
 
 
-def write_dimap(path: Path, pixels: np.ndarray, bits: int = 12, more: str = "") -> Path:
+def write_dimap(path: Path, pixels: np.ndarray = PIXELS, bits: int = 12, more: str = "") -> Path:
     """Write a DIMAP index of two tiles, one above the other, with bits, gains and polynomials."""
     bands, height, width = pixels.shape
     for k in range(2):

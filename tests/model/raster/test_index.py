@@ -42,7 +42,7 @@ def test_each_file_that_an_index_names_is_listed_once(tmp_path: Path) -> None:
     (folder / "sub.vrt").write_text(vrt(ONE))
     assert index_files(folder / "a.vrt") == (folder / "sub.vrt", folder / "tile.tif")
     assert index_files(folder / "tile.tif") == ()
-    images.write_dimap(folder / "DIM.XML", images.digital_numbers())
+    images.write_dimap(folder / "DIM.XML")
     names = [path.name for path in index_files(folder / "DIM.XML")]
     assert names == ["RPC.XML", "IMG_R1C1.TIF", "IMG_R2C1.TIF"]
 
@@ -158,7 +158,7 @@ def test_a_dimap_that_leads_elsewhere_is_refused(
     before: str, after: str, words: str, tmp_path: Path
 ) -> None:
     folder = folder_of(tmp_path)
-    index = images.write_dimap(folder / "DIM.XML", images.digital_numbers())
+    index = images.write_dimap(folder / "DIM.XML")
     text = index.read_text()
     assert before in text
     index.write_text(text.replace(before, after, 1))
@@ -168,7 +168,7 @@ def test_a_dimap_that_leads_elsewhere_is_refused(
 
 
 def test_a_bomb_in_a_file_of_a_dimap_is_refused(tmp_path: Path) -> None:
-    index = images.write_dimap(tmp_path / "DIM.XML", images.digital_numbers())
+    index = images.write_dimap(tmp_path / "DIM.XML")
     (tmp_path / "RPC.XML").write_text(BOMB + "<Dimap_Document>&b;</Dimap_Document>")
     with pytest.raises(ImageError, match="document type"):
         index_files(index)

@@ -116,9 +116,7 @@ def test_damage_gets_one_sentence(tmp_path: Path) -> None:
 
 
 def test_statistics_of_the_raw_pixels_are_not_kept(tmp_path: Path) -> None:
-    with rasterio.open(
-        formats.write_tiff(tmp_path / "a.tif", formats.digital_numbers()), "r+"
-    ) as file:
+    with rasterio.open(formats.write_tiff(tmp_path / "a.tif"), "r+") as file:
         file.update_tags(1, STATISTICS_MEAN="7", GAIN="2")
         file.update_tags(MISSION="a")
     with open_raster(tmp_path / "a.tif") as source:
@@ -142,7 +140,7 @@ def test_sidecars_place_an_image(tmp_path: Path) -> None:
             assert source.raster.place.transform[:6] == (0.5, 0, 300000, 0, -0.5, 4800000)
             assert tmp_path / sidecar in source.files
     tifffile.imwrite(tmp_path / "IMG_a_R1C1.TIF", pixels)
-    formats.write_dimap(tmp_path / "DIM.XML", formats.digital_numbers())
+    formats.write_dimap(tmp_path / "DIM.XML")
     (tmp_path / "RPC.XML").rename(tmp_path / "RPC_a.XML")
     (tmp_path / "DIM.XML").rename(tmp_path / "DIM_a.XML")
     with open_raster(tmp_path / "IMG_a_R1C1.TIF") as source:
