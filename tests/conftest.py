@@ -35,6 +35,13 @@ def scenes_drawn_once() -> None:
         drawing.draw_scenes = lru_cache(maxsize=4)(drawing.draw_scenes)  # type: ignore[attr-defined]
 
 
+@pytest.fixture
+def working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Make a temporary folder the working folder, and return it."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Return the folder of real images, `shared/data` next to the repository."""

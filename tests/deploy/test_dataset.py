@@ -348,9 +348,8 @@ def test_a_folder_of_scenes_becomes_a_dataset_and_the_table_counts_its_pairs(
 
 
 def test_the_explanation_has_each_effect_with_its_origin_and_writes_nothing(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scene: Path, working_folder: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     table = simulate(
         images=scene,
         oversampling=2,
@@ -365,7 +364,7 @@ def test_the_explanation_has_each_effect_with_its_origin_and_writes_nothing(
     assert words["striping"]["from"] == "scene haze-over-sea"
     assert words["mtf"]["from"] == "sensor pleiades-degraded"
     assert all(text["decision"] and text["why"] for text in words.values())
-    assert list(tmp_path.iterdir()) == []
+    assert list(working_folder.iterdir()) == []
 
 
 @pytest.mark.parametrize(
@@ -376,11 +375,10 @@ def test_the_explanation_has_each_effect_with_its_origin_and_writes_nothing(
     ],
 )
 def test_options_that_do_not_go_together_are_refused(
-    options: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    options: str, words: str, working_folder: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     assert words in refused(f"simulate {options}")
-    assert list(tmp_path.iterdir()) == []
+    assert list(working_folder.iterdir()) == []
 
 
 @pytest.mark.parametrize(

@@ -34,14 +34,11 @@ def run_cell(source: str, names: dict[str, Any]) -> str:
     return stream.getvalue()
 
 
-def test_its_cells_run_and_print_the_stored_outputs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_its_cells_run_and_print_the_stored_outputs(working_folder: Path) -> None:
     pytest.importorskip("rasterio")
     pytest.importorskip("pystac")
     import matplotlib.pyplot as plt
 
-    monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
     with plt.rc_context({"backend": "Agg"}):
         for cell in CELLS:
@@ -51,7 +48,7 @@ def test_its_cells_run_and_print_the_stored_outputs(
                 stored = "".join(lines)
                 assert not stored or text == stored
         plt.close("all")
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
+    assert sorted(path.name for path in working_folder.iterdir()) == [
         "raw.jp2",
         "restored-network.json",
         "restored-network.onnx",

@@ -39,17 +39,14 @@ def test_threads_and_processes_are_at_most_the_cores(
         "simulate --out pairs --workers",
     ],
 )
-def test_a_command_names_the_number_of_cores(
-    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "raw.tif").write_bytes(b"not read yet")
+def test_a_command_names_the_number_of_cores(command: str, working_folder: Path) -> None:
+    (working_folder / "raw.tif").write_bytes(b"not read yet")
     words = command.split()
     assert (
         f"{words[-1]} must be 0 to {os.cpu_count()}, the cores of this machine, got 9999"
         in refused(*words, "9999")
     )
-    assert [path.name for path in tmp_path.iterdir()] == ["raw.tif"]
+    assert [path.name for path in working_folder.iterdir()] == ["raw.tif"]
 
 
 @pytest.mark.parametrize("seconds", ["0", "-1", "-0.0", "nan", "inf"])

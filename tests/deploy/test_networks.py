@@ -142,9 +142,8 @@ def test_a_network_for_one_sensor_refuses_a_sensor_for_each_band(
 
 
 @pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-s"])
-def test_a_name_is_the_shipped_network_unless_a_file_has_it(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("working_folder")
+def test_a_name_is_the_shipped_network_unless_a_file_has_it(name: str) -> None:
     for given, int8, precision in (
         (name, None, "float32"),
         (name, True, "int8"),
@@ -154,7 +153,6 @@ def test_a_name_is_the_shipped_network_unless_a_file_has_it(
         network = Network.load(given, sensor=KNOWN, int8=int8)
         assert (network.precision, network.sensor) == (precision, SENSOR)
     assert weights_file(Path(name)) == shipped_weights(name)
-    monkeypatch.chdir(tmp_path)
     Path(name).write_bytes(b"mine")
     with pytest.raises(ModelError, match="an ONNX file"):
         Network.load(name)

@@ -63,16 +63,17 @@ train --variant convbeers-xs --drawn 1 --steps 2 --batch 1 --patch 32 --validate
 
 
 def test_the_chain_opens_no_socket(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_sockets: list[tuple[object, ...]]
+    working_folder: Path, no_sockets: list[tuple[object, ...]]
 ) -> None:
-    weights = tmp_path / "w.safetensors"
-    scenes = tmp_path / "scenes"
+    weights = working_folder / "w.safetensors"
+    scenes = working_folder / "scenes"
     save_network(weights, plain(Variant(1, 4)), {"degraded": "pleiades-degraded"})
     scenes.mkdir()
     rng = np.random.default_rng(0)
     tifffile.imwrite(scenes / "a.tif", rng.integers(200, 1800, (700, 700)).astype(np.uint16))
-    tifffile.imwrite(tmp_path / "raw.tif", rng.integers(200, 1800, (37, 61)).astype(np.uint16))
-    monkeypatch.chdir(tmp_path)
+    tifffile.imwrite(
+        working_folder / "raw.tif", rng.integers(200, 1800, (37, 61)).astype(np.uint16)
+    )
     for command in COMMANDS.strip().splitlines():
         result = CliRunner().invoke(app, command.split())
         # The gate ends with 1 for so small a network.

@@ -148,9 +148,8 @@ def test_every_parameter_is_described_once_and_in_order(name: str) -> None:
 
 @pytest.mark.parametrize(("name", "option", "case"), list(refused_options()), ids=str)
 def test_a_combination_is_refused(
-    name: str, option: str, case: Refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, option: str, case: Refused, working_folder: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     by_name = options(name)
     beside = [existing(word) if word.isupper() else word for word in case.beside.split()]
     needed: list[str] = []
@@ -158,7 +157,7 @@ def test_a_combination_is_refused(
         if parameter.required and parameter.name != option and parameter.label not in beside:
             needed += parameter.switched()
     command = [name, *needed, *beside, *by_name[option].switched()]
-    before = sorted(tmp_path.rglob("*"))
+    before = sorted(working_folder.rglob("*"))
     result = CliRunner().invoke(app, command)
     assert result.exit_code == 2, (command, result.output)
     sentence = result.stderr.removeprefix("beers-deploy: ")
@@ -166,7 +165,7 @@ def test_a_combination_is_refused(
     others = [*case.without.split(), *(word for word in beside if word.startswith("--"))]
     assert any(word in sentence for word in others), (command, sentence)
     assert result.stderr.count("\n") == 1, result.stderr
-    assert sorted(tmp_path.rglob("*")) == before
+    assert sorted(working_folder.rglob("*")) == before
 
 
 @pytest.mark.parametrize(

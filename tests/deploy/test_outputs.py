@@ -302,11 +302,10 @@ def test_the_curves_of_bit_flips_are_an_output_too(tmp_path: Path) -> None:
     refused(command, tmp_path, "curves.svg", "an input of this run")
 
 
-def test_a_socket_is_no_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_socket_is_no_output(working_folder: Path) -> None:
     if not hasattr(socket, "AF_UNIX"):
         pytest.skip("this system has no such sockets")
     # The path of a socket must be short, so the name is relative.
-    monkeypatch.chdir(tmp_path)
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind("figures.json")
-        refused(["bench", "--json", "figures.json"], tmp_path, "not a regular file")
+        refused(["bench", "--json", "figures.json"], working_folder, "not a regular file")

@@ -169,10 +169,9 @@ POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize
 )
 @pytest.mark.parametrize("kind", ["pointer", "folder"])
 def test_a_pointer_or_folder_in_place_of_a_file_is_named(
-    command: list[str], name: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: list[str], name: str, kind: str, working_folder: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    path = tmp_path / name
+    path = working_folder / name
     path.mkdir() if kind == "folder" else path.write_text(POINTER)
     message = refused(*(word.format(path) for word in command))
     assert name in message

@@ -2,7 +2,6 @@
 
 import doctest
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,10 +17,8 @@ WITHOUT_EXAMPLE = {"demo", "export", "golden", "stress", "train"}
 
 
 @pytest.mark.parametrize("name", vars(bd)["__all__"])
-def test_the_example_prints_what_it_shows(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.usefixtures("working_folder")
+def test_the_example_prints_what_it_shows(name: str) -> None:
     parser = doctest.DocTestParser()
     text = getattr(bd, name).__doc__
     example = parser.get_doctest(text, {"bd": bd, "np": np}, name, None, None)

@@ -48,15 +48,12 @@ def test_a_path_found_writable_can_be_written_and_the_check_leaves_nothing(
     assert (tmp_path / below).read_text(encoding="utf-8") == "text"
 
 
-def test_a_folder_is_refused_and_a_relative_path_is_accepted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_folder_is_refused_and_a_relative_path_is_accepted(working_folder: Path) -> None:
     with pytest.raises(MachineError, match="a folder"):
-        require_writable(tmp_path)
+        require_writable(working_folder)
     require_writable(None)
     require_writable(Path("new/out"))
-    assert list(tmp_path.iterdir()) == []
+    assert list(working_folder.iterdir()) == []
 
 
 @pytest.mark.skipif(

@@ -166,13 +166,11 @@ def test_wrong_arguments(
     arguments: list[str],
     message: str,
     pair: list[Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    working_folder: Path,
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     files = {"FLOAT": str(pair[0]), "INT8": str(pair[1])}
     assert message in refused("stress", *(files.get(text, text) for text in arguments))
-    assert not list(tmp_path.iterdir())
+    assert not list(working_folder.iterdir())
 
 
 def test_the_page_is_fresh() -> None:

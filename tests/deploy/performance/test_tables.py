@@ -162,12 +162,11 @@ def test_bench_on_this_machine(tmp_path: Path) -> None:
     ],
 )
 def test_bench_refuses_what_does_not_go_together(
-    options: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    options: str, message: str, working_folder: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     tifffile.imwrite("colour.tif", np.zeros((8, 9, 3), np.uint8), photometric="rgb")
     tifffile.imwrite("half.tif", np.full((8, 9), 0.5, np.float32))
-    integer_convbeers(tmp_path / "net.onnx", 1, 8)
+    integer_convbeers(working_folder / "net.onnx", 1, 8)
     assert message in refused(f"bench net.onnx {options}")
 
 

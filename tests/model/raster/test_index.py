@@ -78,10 +78,9 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED)
 @pytest.mark.parametrize("name", ["a.vrt", "b.vrt"], ids=["directly", "through another"])
 def test_an_index_that_leads_elsewhere_is_refused(
-    name: str, case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, case: str, working_folder: Path
 ) -> None:
-    folder = folder_of(tmp_path)
-    monkeypatch.chdir(tmp_path)
+    folder = folder_of(working_folder)
     text, words = REFUSED[case]
     (folder / "a.vrt").write_text(text)
     (folder / "b.vrt").write_text(vrt(naming("a.vrt")))

@@ -88,10 +88,9 @@ def test_dior_s_tree_is_read_and_nothing_in_it_is_written_over(tmp_path: Path) -
     ],
 )
 def test_a_wrong_option_is_refused_in_one_sentence(
-    arguments: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    arguments: list[str], words: str, working_folder: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    voc(tmp_path / "ships")
+    voc(working_folder / "ships")
     command = [
         "evaluate",
         "--detector",
@@ -109,7 +108,7 @@ def test_a_wrong_option_is_refused_in_one_sentence(
     message = refused(*command)
     assert message.count("beers-deploy: ") == 1
     assert words in message.split("beers-deploy: ")[1]
-    assert not (tmp_path / "detection" / "report.html").exists()
+    assert not (working_folder / "detection" / "report.html").exists()
 
 
 @pytest.mark.parametrize(

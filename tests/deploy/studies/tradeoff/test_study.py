@@ -155,9 +155,8 @@ def test_the_command_writes_its_files_where_nothing_is_recommended(
 
 
 def test_a_preview_counts_what_is_measured_and_writes_nothing(
-    folder: Path, study: Tradeoff, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, study: Tradeoff, working_folder: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     table = tradeoff(
         network=str(folder / "narrow.safetensors"),
         images=folder / "images",
@@ -172,4 +171,4 @@ def test_a_preview_counts_what_is_measured_and_writes_nothing(
     assert row.figures["images"].value == SITES
     assert row.figures["time here"].mode == "predicted"
     assert (row.figures["time here"].value or 0.0) > 0
-    assert list(tmp_path.iterdir()) == []
+    assert list(working_folder.iterdir()) == []
