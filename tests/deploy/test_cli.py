@@ -134,7 +134,6 @@ def test_a_name_that_the_terminal_cannot_show_ends_no_run(tmp_path: Path) -> Non
         env=environment,
         capture_output=True,
         encoding="cp1252",
-        check=False,
     )
     assert process.returncode == 0, process.stderr
     assert "\\u6771\\u4eac" in process.stdout
@@ -181,7 +180,7 @@ def run_with(closing: str, *words: object) -> tuple[int, str]:
     """Run the program with redirected streams, and return its exit code and remaining output."""
     words = (sys.executable, "-m", "beers_deploy", *words)
     line = ["/usr/bin/env", "bash", "-c", f'"$@" {closing}', "bash", *map(str, words)]
-    process = subprocess.run(line, capture_output=True, text=True, check=False)
+    process = subprocess.run(line, capture_output=True, text=True)
     return process.returncode, process.stdout + process.stderr
 
 
@@ -215,7 +214,6 @@ def test_an_installation_that_does_not_work_is_no_failed_gate(module: str, tmp_p
         env={**os.environ, "PYTHONPATH": str(tmp_path)},
         capture_output=True,
         text=True,
-        check=False,
     )
     assert process.returncode == CRASHED
     assert process.stderr.splitlines()[-1].startswith(

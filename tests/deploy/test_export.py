@@ -65,7 +65,7 @@ def test_a_network_behind_a_bank_is_exported_for_one_sensor(
     banked = behind_a_bank(Variant(1, 8, scale), 0.1)
     sensor = Sensor.load("pleiades-degraded").nominal()
     model = banked_to_onnx(Weights(arrays(banked.state_dict()), banked.variant, {}), sensor, {})
-    image = np.random.default_rng(1).random((2, 1, rows, columns), dtype=np.float32) * 0.02 + 0.4
+    image = np.random.default_rng(1).random((2, 1, rows, columns), np.float32) * 0.02 + 0.4
     with torch.inference_mode():
         expected = for_sensor(banked, vector_tensor(sensor), network_bank(sensor))(
             torch.from_numpy(image)

@@ -29,7 +29,7 @@ from tests.deploy.command_line import done, refused
 from tests.quant.quick import Calibration, change, changed, drawn
 from tests.shipped import shipped_pair
 
-Corrupt = Callable[[onnx.ModelProto], None]
+Corrupt = Callable[[onnx.ModelProto], object]
 
 
 @pytest.fixture(scope="module")

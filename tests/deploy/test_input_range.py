@@ -8,6 +8,7 @@ import onnxruntime as ort
 import pytest
 import tifffile
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from torch import nn
 
 import beers_deploy as bd
@@ -122,7 +123,7 @@ def test_restore_maps_full_scale_onto_a_stated_range() -> None:
     how: dict[str, Any] = {"full_scale": 1, "progress": False, "force": True, "tile": 24}
     restored = bd.restore(shares, network=stated, **how)
     expected = (stated(given[:1])[0] + 1) / 2
-    np.testing.assert_allclose(restored, np.clip(expected, 0, 1), atol=1e-5)
+    assert_allclose(restored, np.clip(expected, 0, 1), atol=1e-5)
     with pytest.raises(ModelError, match="Quantise it again with `input_range`"):
         bd.restore(shares, network=found, **how)
 
@@ -151,7 +152,7 @@ def test_image_files_are_samples_of_a_stated_range(tmp_path: Path) -> None:
         cores.append(read_core(int8.model).convolutions[0])
         compared = bd.compare(floating, int8, samples=given, progress=False)
         maes.append(compared.result.mae)
-    np.testing.assert_array_equal(cores[0].weight, cores[1].weight)
+    assert_array_equal(cores[0].weight, cores[1].weight)
     assert maes[0] == pytest.approx(maes[1], rel=1e-3)
     with one_guess():
         found = bd.quantize(floating, samples=values, progress=False)

@@ -90,7 +90,7 @@ def alone(home: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
     environment = {**inherited, "HOME": str(home), "TMPDIR": str(home)}
     command = [sys.executable, *map(str, arguments)]
     return subprocess.run(
-        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300, check=False
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300
     )
 
 

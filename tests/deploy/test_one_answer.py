@@ -299,7 +299,7 @@ def test_quantize_warns_of_what_the_board_refuses(
     board = "zcu102"
     with caplog.at_level(logging.WARNING, "beers_deploy"):
         int8 = quickly(path, target=board)
-    (warning,) = (record.getMessage() for record in caplog.records)
+    (warning,) = caplog.messages
     assert warning.startswith(f"{board} does not run it: check FAILED")
     assert "LeakyRelu stands behind add" in warning
     assert not bd.check(int8, target=board)

@@ -157,7 +157,7 @@ class Runner:
         }
 
 
-KEPT: dict[str, Any] = {"capture_output": True, "text": True, "check": False}
+KEPT: dict[str, Any] = {"capture_output": True, "text": True}
 
 
 def value_of(text: str, context: dict[str, str]) -> str:

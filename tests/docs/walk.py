@@ -169,7 +169,6 @@ class Walk:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             encoding="utf-8",
-            check=False,
         )
 
     def _compare(self, page_text: str) -> None:

@@ -31,7 +31,7 @@ def differences(
     session = open_session(model)
     lines = []
     for size in sizes:
-        image = np.random.default_rng(0).random(size, dtype=np.float32)
+        image = np.random.default_rng(0).random(size, np.float32)
         with torch.inference_mode():
             expected = network(torch.from_numpy(image)).numpy()
         (output,) = session.run(None, {"input": image})

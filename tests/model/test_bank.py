@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from torch.nn.functional import conv2d, pixel_unshuffle
 
 from beers_deploy.model.bank import (
@@ -53,7 +54,7 @@ def test_details_have_sum_0_and_noise_makes_planes_of_one_size(
     # Details without a mean keep the gain of every restoration 1 at DC.
     assert np.abs(bank.details.sum((1, 2))).max() < 1e-12
     noise = bank.sigma * np.sqrt(np.square(bank.planes).sum((1, 2)))
-    np.testing.assert_allclose(noise, 1 / UNIT, rtol=1e-12)
+    assert_allclose(noise, 1 / UNIT, rtol=1e-12)
     assert bank.unit == pytest.approx(UNIT * bank.sigma * np.linalg.norm(bank.analytic))
 
 
@@ -63,7 +64,7 @@ def test_a_lopsided_point_spread_transposed_has_its_kernels_transposed() -> None
     upright, turned = (
         network_bank(with_response(NOMINAL, point_spread)) for point_spread in (point, other)
     )
-    np.testing.assert_allclose(turned.details.transpose(0, 2, 1), upright.details, atol=1e-6)
+    assert_allclose(turned.details.transpose(0, 2, 1), upright.details, atol=1e-6)
     # Control: the kernels are not symmetric. Otherwise the test would prove nothing.
     assert np.abs(upright.details - upright.details[:, ::-1, ::-1]).max() > 0.01
 
@@ -160,4 +161,4 @@ def test_a_sensor_vector_gives_the_bank_of_its_sensor(
     from_vector = bank_of_vector(sensor_vector(instrument).values)
     own = network_bank(instrument)
     assert from_vector.sigma == pytest.approx(own.sigma)
-    np.testing.assert_allclose(from_vector.details, own.details, atol=1e-9)
+    assert_allclose(from_vector.details, own.details, atol=1e-9)

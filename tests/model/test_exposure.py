@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 
 from beers_deploy.model.exposure import (
@@ -171,7 +172,7 @@ def test_a_part_chooses_as_the_whole_image_does(
         top - row :, left - column :
     ]
     in_image = choose_factors(image, factors, radius_px, FULL_SCALE, 0.0)[top:bottom, left:right]
-    np.testing.assert_array_equal(in_part[: bottom - top, : right - left], in_image)
+    assert_array_equal(in_part[: bottom - top, : right - left], in_image)
 
 
 def test_the_offset_is_no_light() -> None:
@@ -180,4 +181,4 @@ def test_the_offset_is_no_light() -> None:
     plain = choose_factors(image, (1, 4, 8), 0, FULL_SCALE, 0.0)
     assert np.unique(plain).tolist() == [1, 4, 8]
     shifted = choose_factors(image + 100, (1, 4, 8), 0, FULL_SCALE + 100 / HEADROOM, 100.0)
-    np.testing.assert_array_equal(shifted, plain)
+    assert_array_equal(shifted, plain)

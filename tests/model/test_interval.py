@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from beers_deploy.model.family import noise_over_full_scale
 from beers_deploy.model.interval import LEAST_DETAIL, MIDDLE_NOISE, PixelInterval
@@ -38,7 +39,7 @@ def test_half_widths_follow_the_formula_and_the_units() -> None:
     assert half.dtype == np.float32
     # The same image in other units, here fractions of full scale.
     scaled = INTERVAL.for_sensor(NOMINAL, 1.0, 90).of(pixels / MAX_DN, known)
-    np.testing.assert_allclose(scaled * MAX_DN, half, rtol=1e-5)
+    assert_allclose(scaled * MAX_DN, half, rtol=1e-5)
 
 
 def test_windows_need_one_pixel_of_context_and_leave_missing_pixels_out() -> None:
@@ -47,7 +48,7 @@ def test_windows_need_one_pixel_of_context_and_leave_missing_pixels_out() -> Non
     known = np.ones(pixels.shape, bool)
     width = INTERVAL.for_sensor(NOMINAL, MAX_DN, 90)
     whole = width.of(pixels, known)
-    np.testing.assert_array_equal(width.of(pixels[6:15], known[6:15])[1:-1], whole[7:14])
+    assert_array_equal(width.of(pixels[6:15], known[6:15])[1:-1], whole[7:14])
     # Negative control: without context the outer rows differ.
     assert (width.of(pixels[6:15], known[6:15])[0] != whole[6]).any()
     known[10, 10] = False
@@ -58,10 +59,10 @@ def test_windows_need_one_pixel_of_context_and_leave_missing_pixels_out() -> Non
     assert np.isnan(first[10, 10])
     assert np.isfinite(first).sum() == first.size - 1
     for half in others:
-        np.testing.assert_array_equal(half, first)
+        assert_array_equal(half, first)
     far = np.ones(pixels.shape, bool)
     far[9:12, 9:12] = False
-    np.testing.assert_array_equal(first[far], whole[far])
+    assert_array_equal(first[far], whole[far])
 
 
 def test_flat_ground_has_a_width_and_none_exceeds_full_scale() -> None:

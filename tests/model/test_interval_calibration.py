@@ -6,6 +6,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from beers_deploy.model.interval import Conditions, Exponents
 from beers_deploy.model.interval_calibration import (
@@ -89,7 +90,7 @@ def test_the_fit_finds_the_exponents_that_made_the_errors() -> None:
     sensors = enumerate(product(blurs, blurs))
     samples = [sample_of(EXPONENTS, seed, blur, noise) for seed, (blur, noise) in sensors]
     fit = fit_exponents(samples)
-    np.testing.assert_allclose(astuple(fit), astuple(EXPONENTS), atol=0.03)
+    assert_allclose(astuple(fit), astuple(EXPONENTS), atol=0.03)
 
 
 def test_one_sensor_alone_is_fitted_by_its_detail() -> None:
@@ -143,4 +144,4 @@ def test_a_sample_leaves_out_the_border_and_saturated_pixels() -> None:
     restored = raw + 1
     sample = Sample.of(raw, restored, raw, NOMINAL)
     assert sample.error.size == (60 - 2 * BORDER_PX) * (70 - 2 * BORDER_PX) - 5
-    np.testing.assert_allclose(sample.error, 1)
+    assert_allclose(sample.error, 1)

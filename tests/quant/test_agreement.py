@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from beers_deploy.model.shipped import SHIPPED
 from beers_deploy.quant.encodings import read_core
@@ -14,13 +15,7 @@ from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.quantize import Quantized
 from tests.quant.quick import changed
 
-IMAGE = np.random.default_rng(4).random((2, 1, 35, 41), dtype=np.float32)
-
-
-def test_every_layer_of_a_new_file_is_equal(quantized: Quantized) -> None:
-    layers = agreement(quantized.core, quantized.host, IMAGE).layers
-    assert [layer.report.name for layer in layers] == [op.name for op in quantized.core.ops]
-    assert {layer.unequal for layer in layers} == {0.0}
+IMAGE = np.random.default_rng(4).random((2, 1, 35, 41), np.float32)
 
 
 @pytest.mark.parametrize("path", sorted(SHIPPED.glob("*-int8.onnx")), ids=lambda path: path.stem)
@@ -29,6 +24,7 @@ def test_every_layer_of_a_shipped_file_is_equal(path: Path) -> None:
     core = read_core(model)
     height, width = (size - size % core.host_part.place_px for size in IMAGE.shape[2:])
     layers = agreement(core, model, IMAGE[:1, :, :height, :width])
+    assert [layer.report.name for layer in layers.layers] == [op.name for op in core.ops]
     assert {layer.unequal for layer in layers.layers} == {0.0}
     assert (layers.up != layers.even).any()
 
@@ -44,6 +40,7 @@ def test_a_layer_that_computes_something_else_is_found(quantized: Quantized) -> 
 
 def test_changes_by_the_rounding_rule_are_counted(quantized: Quantized) -> None:
     layers = agreement(quantized.core, quantized.host, IMAGE)
+    assert {layer.unequal for layer in layers.layers} == {0.0}
     up, even = (
         run_core(quantized.core, IMAGE_SLICES.encode(IMAGE), half_even=rule)[0]
         for rule in (False, True)
@@ -52,6 +49,6 @@ def test_changes_by_the_rounding_rule_are_counted(quantized: Quantized) -> None:
         difference = up[op.output] - even[op.output]
         assert layer.moved == pytest.approx(np.count_nonzero(difference) / difference.size)
         assert layer.moved_by == np.abs(difference).max()
-    np.testing.assert_array_equal(layers.up, merged_correction(quantized.core, up))
-    np.testing.assert_array_equal(layers.even, merged_correction(quantized.core, even))
+    assert_array_equal(layers.up, merged_correction(quantized.core, up))
+    assert_array_equal(layers.even, merged_correction(quantized.core, even))
     assert max(layer.moved for layer in layers.layers) > 0

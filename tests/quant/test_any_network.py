@@ -10,6 +10,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from numpy.testing import assert_array_equal
 
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
@@ -80,7 +81,7 @@ def test_the_integer_reference_equals_the_runtime_bit_for_bit(name: str) -> None
     layers = agreement(int8.core, int8.host, image)
     assert [layer.report.name for layer in layers.layers if layer.unequal] == []
     result = run_model(int8.host, image)
-    np.testing.assert_array_equal(int8.core.host_part.finish(image, layers.even), result)
+    assert_array_equal(int8.core.host_part.finish(image, layers.even), result)
 
 
 @EACH
@@ -105,14 +106,14 @@ def test_a_file_is_read_back_as_the_core_it_was_written_from(name: str) -> None:
     core = read_core(int8.host)
     assert encoding_faults(int8.host) == []
     for one, other in zip(core.convolutions, int8.core.convolutions, strict=True):
-        np.testing.assert_array_equal(one.weight, other.weight)
+        assert_array_equal(one.weight, other.weight)
         assert (one.window, one.groups, one.activation) == (
             other.window,
             other.groups,
             other.activation,
         )
     planes = int8.core.host_part.encode(images(name)[0])
-    np.testing.assert_array_equal(
+    assert_array_equal(
         run_core(core, planes)[0]["correction"], run_core(int8.core, planes)[0]["correction"]
     )
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene
@@ -49,8 +50,8 @@ def test_patches_are_the_same_at_each_access(drawn: Patches) -> None:
         alone = drawn.degraded[number]
         assert alone.shape == once[1].shape == (1, 1, 40, 40)
         assert alone.dtype == once[1].dtype == np.float32
-        np.testing.assert_array_equal(once, second)
-        np.testing.assert_array_equal(alone, once[0])
+        assert_array_equal(once, second)
+        assert_array_equal(alone, once[0])
         # Both sensors see the same ground.
         assert np.corrcoef(once[0].ravel(), once[1].ravel())[0, 1] > 0.7
     with pytest.raises(IndexError):
@@ -126,7 +127,7 @@ def test_pieces_contain_the_values_of_the_whole_image(graph: Graph, shape: tuple
     )
     for tensor, parts in zip(expected, zip(*pieces, strict=True), strict=True):
         values = np.sort(np.concatenate([part.ravel() for part in parts]))
-        np.testing.assert_allclose(values, np.sort(tensor, axis=None), rtol=1e-5, atol=1e-6)
+        assert_allclose(values, np.sort(tensor, axis=None), rtol=1e-5, atol=1e-6)
     sides_px = [array.base.shape[2] for array in chain.from_iterable(pieces)]  # type: ignore[union-attr]
     assert max(sides_px) <= TILE_PX + 2 * halo_px
     if len(pieces) > 1:
@@ -138,7 +139,7 @@ def test_crops_tile_the_image() -> None:
     full_image = image(2 * TILE_PX + 5, TILE_PX)
     pieces = crops(full_image)
     assert [max(crop.shape) <= TILE_PX for crop in pieces] == [True] * 3
-    np.testing.assert_array_equal(np.concatenate(pieces, axis=2), full_image)
+    assert_array_equal(np.concatenate(pieces, axis=2), full_image)
 
 
 def test_scales_of_a_large_image_are_those_of_whole_tensors(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 
 from beers_deploy.quant.samples.coverage import (
     KEY,
@@ -27,7 +28,7 @@ def test_percentiles_are_those_of_all_pixels_however_they_are_divided(
     values = np.array(pixels, np.float32) / np.float32(4095)
     sample_range = range_from(sum(map(histogram, np.array_split(values, parts)), np.zeros(1)))
     expected = np.quantile(values, [0.01, 0.5, 0.99, 0.999], method="inverted_cdf")
-    np.testing.assert_allclose(
+    assert_allclose(
         [sample_range.p1, sample_range.p50, sample_range.p99, sample_range.p99_9],
         expected,
         atol=2 / 4096,
@@ -41,7 +42,7 @@ def test_a_recorded_range_is_read_back(values: list[float], saturated: float) ->
     sample_range = SampleRange(p1, p50, p99, p99_9, saturated)
     stored = recorded_range({KEY: sample_range.to_words()})
     assert stored is not None
-    np.testing.assert_allclose(astuple(stored), astuple(sample_range), atol=1e-6)
+    assert_allclose(astuple(stored), astuple(sample_range), atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ import os
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from beers_deploy.model.shipped import INT8, shipped_names
 from beers_deploy.network import Network
@@ -35,17 +35,17 @@ def vectors(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 def test_c_computes_the_golden_integers(vectors: Vectors, compiler: str) -> None:
     if shutil.which(compiler) is None:
         pytest.skip(f"no {compiler}")
-    np.testing.assert_array_equal(vectors.by_c([compiler, "-O2"]), vectors.result)
+    assert_array_equal(vectors.by_c([compiler, "-O2"]), vectors.result)
 
 
 def test_onnxruntime_differs_by_ties_alone(vectors: Vectors) -> None:
     even = vectors.half_even()
     host = vectors.by_onnxruntime_host()
-    np.testing.assert_array_equal(host, even[: len(host)])
+    assert_array_equal(host, even[: len(host)])
     assert 0 < vectors.differing(even) < 0.5
     # The core looks a separate activation up in a table, which rounds ties up in any case.
     if not any(isinstance(op, Pointwise) for op in vectors.core.ops):
-        np.testing.assert_array_equal(vectors.by_onnxruntime_board(), even)
+        assert_array_equal(vectors.by_onnxruntime_board(), even)
 
 
 @pytest.mark.skipif(AIDGE is None, reason="BEERS_AIDGE_PYTHON names no environment of Aidge")
@@ -56,4 +56,4 @@ def test_aidge_computes_the_golden_integers(vectors: Vectors) -> None:
     if any(isinstance(op, Pointwise) and op.activation in hard for op in vectors.core.ops):
         assert 0 < vectors.differing(result) < 0.2
     else:
-        np.testing.assert_array_equal(result, vectors.result)
+        assert_array_equal(result, vectors.result)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 from beers_deploy.model.progress import Step, progress, reporting
 from beers_deploy.profiles.errors import ImageError
@@ -70,8 +71,8 @@ def test_it_begins_with_the_core_s_own_numbers(quantized: Quantized) -> None:
     """Without a training step, the integers are those of the core."""
     unchanged = TrainableCore(quantized.core).core()
     for one, other in zip(quantized.core.convolutions, unchanged.convolutions, strict=True):
-        np.testing.assert_array_equal(one.weight, other.weight)
-        np.testing.assert_array_equal(one.bias, other.bias)
+        assert_array_equal(one.weight, other.weight)
+        assert_array_equal(one.bias, other.bias)
 
 
 @given(seed=st.integers(0, 2**32 - 1))
@@ -238,7 +239,7 @@ def test_the_correction_of_a_result_gives_that_result(
     host_part = HostPart(back=back, adds_image=adds)
     image, result = (generator.random((1, 1, 36, 72)).astype(np.float32) for _ in range(2))
     result_again = host_part.finish(image, host_part.correction_of(image, result))
-    np.testing.assert_allclose(result_again, result, atol=2e-7)
+    assert_allclose(result_again, result, atol=2e-7)
 
 
 @pytest.mark.slow

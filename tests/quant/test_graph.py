@@ -3,6 +3,7 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+from numpy.testing import assert_array_equal
 from onnx import helper
 
 from beers_deploy.profiles.errors import ModelError
@@ -27,7 +28,7 @@ from tests.quant.quick import behind_conv, copied, run_model
 def test_no_digital_number_is_lost_in_planes_nor_wrapped() -> None:
     dn = np.arange(MAX_DN + 1, dtype=np.float32).reshape(1, 1, 64, 64)
     planes = IMAGE_SLICES.encode(dn / np.float32(MAX_DN)).astype(np.int32)
-    np.testing.assert_array_equal(STEP * planes[:, :1] + planes[:, 1:2], dn.astype(np.int32))
+    assert_array_equal(STEP * planes[:, :1] + planes[:, 1:2], dn.astype(np.int32))
     assert np.abs(QUARTER * planes[:, 2:] - planes[:, 1:2]).max() <= QUARTER / 2
     low, high = (
         IMAGE_SLICES.encode(np.full((1, 1, 1, 1), v, np.float32)).ravel().tolist()
@@ -46,7 +47,7 @@ def test_a_plain_network_keeps_its_weights_and_relus_and_leaves_the_global_add(
     assert isinstance(graph[0], Conv)
     assert isinstance(graph[-1], Conv)
     stored = next(t for t in float_onnx.graph.initializer if t.name == "head.weight")
-    np.testing.assert_array_equal(graph[0].weight, onnx.numpy_helper.to_array(stored))
+    assert_array_equal(graph[0].weight, onnx.numpy_helper.to_array(stored))
     assert sum(isinstance(op, Add) for op in graph) == 3
 
 

@@ -11,6 +11,7 @@ import pytest
 import tifffile
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from onnx import helper
 
 from beers_deploy.profiles.errors import ImageError, OptionError
@@ -141,7 +142,7 @@ def test_a_network_of_scaled_channels_has_the_same_integers(
     assert same_integers(plain.core, other.core)
     expected = run_model(plain.host, images[0])
     actual = run_model(other.host, wide[0])
-    np.testing.assert_array_equal(actual, expected)
+    assert_array_equal(actual, expected)
 
 
 @settings(max_examples=25)
@@ -173,7 +174,7 @@ def test_padding_stays_zero(
     actual = part.finish(image, correction)
     expected = run_model(model, image)
     # Half a digital number at each of up to 4 * 9 taps, whose weights are below 1.5.
-    np.testing.assert_allclose(actual, expected, atol=36 * 1.5 * 30 / (2 * MAX_DN))
+    assert_allclose(actual, expected, atol=36 * 1.5 * 30 / (2 * MAX_DN))
 
 
 @settings(max_examples=20)
@@ -206,7 +207,7 @@ def test_numpy_onnx_and_description_agree(
     scale = int8.core.scale("correction")
     correction = tensors["correction"].astype(np.float32) * np.float32(scale)
     restored = run_model(int8.host, image)
-    np.testing.assert_array_equal(part.restore(image, correction, scale), restored)
+    assert_array_equal(part.restore(image, correction, scale), restored)
     assert part.clip_limits == (limits or ())
     if limits:
         assert limits[0] <= restored.min() <= restored.max() <= limits[1]
@@ -290,7 +291,7 @@ def test_shares_are_inverse(ranges: Ranges) -> None:
     """An image that is mapped to its range and back is the image again."""
     image = shares(len(ranges), 4, 5, 1)[0]
     again = to_shares(from_shares(image, ranges), ranges)
-    np.testing.assert_allclose(again, image, atol=1e-3)
+    assert_allclose(again, image, atol=1e-3)
 
 
 @given(RANGES)
@@ -355,7 +356,7 @@ def test_image_files_are_mapped_onto_a_stated_range(ranges: Ranges) -> None:
         np.save(f"{folder}/b.npy", expected)
         samples = read_samples(Path(folder), 3, None, ranges=ranges)
     for image in samples.all.degraded:
-        np.testing.assert_allclose(image[0], expected, atol=1e-4)
+        assert_allclose(image[0], expected, atol=1e-4)
     assert samples.stated
 
 
@@ -368,7 +369,7 @@ def test_a_channel_of_zeros_may_be_a_little_below() -> None:
     image[:, 1] = -1e-8
     assert ranges_of([image]) == ()
     image[:, 1] = -1e-3
-    np.testing.assert_allclose(ranges_of([image]), ((0.0, 1.0), (-1e-3, 0.0)))
+    assert_allclose(ranges_of([image]), ((0.0, 1.0), (-1e-3, 0.0)))
 
 
 @pytest.mark.parametrize(

@@ -214,7 +214,7 @@ def test_a_relu_that_is_an_output_is_left_alone() -> None:
     model = load_onnx(SMALL[0])
     relu = next(node.output[0] for node in model.graph.node if node.op_type == "Max")
     model.graph.output.append(helper.make_tensor_value_info(relu, TensorProto.UINT8, None))
-    image = np.random.default_rng(0).random((1, 1, 13, 21), dtype=np.float32)
+    image = np.random.default_rng(0).random((1, 1, 13, 21), np.float32)
     as_written = open_session(model, 1, exact=False)
     exact = open_session(model, 1, exact=True)
     lowest = exact.run([relu], {"image": image})[0].min()
@@ -265,7 +265,7 @@ def test_files_of_other_quantizers_give_the_same_numbers(
         "activation_type": activations,
         "weight_type": QuantType.QInt8,
     }
-    noise = list(np.random.default_rng(4).random((4, 1, 1, 24, 24), dtype=np.float32))
+    noise = list(np.random.default_rng(4).random((4, 1, 1, 24, 24), np.float32))
     onnx.save_model(float_onnx, tmp_path / "float.onnx")
     quantize_static(
         tmp_path / "float.onnx", tmp_path / "theirs.onnx", Calibration(noise), **options
@@ -304,7 +304,7 @@ def test_no_convolution_stays_narrow_and_the_numbers_are_the_same(path: Path) ->
         assert new[1] % 4 == 0
         assert new[1] - old[1] < 4
     for shape in ((4, 4), (37, 53), (64, 41)):
-        image = generator.random((1, 1, *shape), dtype=np.float32)
+        image = generator.random((1, 1, *shape), np.float32)
         assert np.array_equal(as_written(wider, image), as_written(model, image))
 
 

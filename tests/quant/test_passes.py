@@ -8,6 +8,7 @@ from unittest.mock import patch
 import numpy as np
 import onnx
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from beers_deploy.model.progress import Step, progress, reporting
 from beers_deploy.quant.core import IntConv
@@ -65,7 +66,7 @@ def correction(graph: Graph) -> np.ndarray:
 def test_equalizing_leaves_the_float_network_as_it_was(graph: Graph) -> None:
     factors = np.random.default_rng(1).uniform(0.2, 5, 8)
     scaled = equalize(graph, group_of(graph), factors)
-    np.testing.assert_allclose(correction(scaled), correction(graph), atol=2e-6)
+    assert_allclose(correction(scaled), correction(graph), atol=2e-6)
     first_alone = (scaled[0], *graph[1:])
     assert np.abs(correction(first_alone) - correction(graph)).max() > 1e-3
 
@@ -76,9 +77,9 @@ def test_ranges_are_equalized_to_the_group_s_own(graph: Graph, patches: Patches)
     ranges = channel_ranges(graph, group, images)
     assert ranges.shape == (8,)
     factors = first_guess(ranges, 1.0, 1.0)
-    np.testing.assert_allclose(ranges * factors, 127 * 2.0**-GROUP_FRAC_BITS)
+    assert_allclose(ranges * factors, 127 * 2.0**-GROUP_FRAC_BITS)
     new_ranges = channel_ranges(equalize(graph, group, factors), group, images)
-    np.testing.assert_allclose(new_ranges, ranges * factors, rtol=1e-4)
+    assert_allclose(new_ranges, ranges * factors, rtol=1e-4)
     # A channel that is dead but for rounding keeps a range, so that no factor amplifies it.
     dead = equalize(graph, group, np.where(np.arange(8) == 3, 1e-12, 1))
     dead_ranges = channel_ranges(dead, group, images[:1])
@@ -124,7 +125,7 @@ def test_a_group_goes_through_pools_enlargements_and_concats() -> None:
         open_session(graph_to_onnx(each, [CORRECTION])).run(None, planes)[0]
         for each in (graph, scaled)
     )
-    np.testing.assert_allclose(actual, expected, atol=1e-4)
+    assert_allclose(actual, expected, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -142,7 +143,7 @@ def test_a_group_goes_through_activations_in_proportion_to_their_input(
     assert [set(group) for group in groups] == passes * [{"head", "inner", "sum", "active"}]
     for group in groups:
         scaled = equalize(graph, group, np.random.default_rng(2).lognormal(-1, 1, 3))
-        np.testing.assert_allclose(correction(scaled), correction(graph), atol=2e-6)
+        assert_allclose(correction(scaled), correction(graph), atol=2e-6)
 
 
 def test_a_tensor_with_two_positions_in_a_concat_is_in_no_group() -> None:
@@ -248,7 +249,7 @@ def test_a_shared_residual_scale_adds_without_rounding(quantized: Quantized) -> 
 def test_the_second_gain_is_the_same_correction_coarser(graph: Graph) -> None:
     both = correction(with_copies(graph, DualRange()))
     assert both.shape[1] == 2
-    np.testing.assert_allclose(both[:, 1:] * GAIN, correction(graph), atol=1e-6)
+    assert_allclose(both[:, 1:] * GAIN, correction(graph), atol=1e-6)
 
 
 def test_the_fine_copy_is_used_until_it_saturates() -> None:
@@ -257,7 +258,7 @@ def test_the_fine_copy_is_used_until_it_saturates() -> None:
     coarse = np.array([50, 51, 52, 53, -54, -55]) * scale
     copies = np.stack([fine, coarse]).astype(np.float32)[None, :, None]
     values = DualRange().decode(copies, scale)[0, 0, 0]
-    np.testing.assert_array_equal(values / scale, [0, 126, -126, 53 * GAIN, -54 * GAIN, -55 * GAIN])
+    assert_array_equal(values / scale, [0, 126, -126, 53 * GAIN, -54 * GAIN, -55 * GAIN])
     assert FINE_MAX == 126
     one = np.full((1, 1, 2, 2), 127 * scale, np.float32)
     assert Plain().decode(one, scale) is one

@@ -8,6 +8,7 @@ import numpy as np
 import onnx
 import pytest
 import tifffile
+from numpy.testing import assert_allclose, assert_array_equal
 from onnx import TensorProto, helper
 
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
@@ -32,7 +33,7 @@ def test_samples_are_cut_to_patches_of_aligned_sides(tmp_path: Path) -> None:
     large_path = stored(tmp_path / "ramp.npy", RAMP)
     samples = read_samples(large_path, 2, None, 4).all
     assert [image.shape for image in samples.degraded] == [(1, 2, 128, 128)] * 3
-    np.testing.assert_array_equal(samples.degraded[1][0], RAMP[1, :, :128, :128])
+    assert_array_equal(samples.degraded[1][0], RAMP[1, :, :128, :128])
     small_path = stored(tmp_path / "small.npy", RAMP[:, :, :50, :37])
     small = read_samples(small_path, 2, None, 4).all
     assert small.degraded[0].shape == (1, 2, 48, 36)
@@ -48,8 +49,8 @@ def test_references_stay_with_their_images(tmp_path: Path) -> None:
     pairs = read_samples(path, 1, None).all.pairs
     assert len(pairs) == len(images)
     for number, (image, reference) in enumerate(pairs):
-        np.testing.assert_array_equal(image[0], images[number])
-        np.testing.assert_array_equal(reference[0], references[number])
+        assert_array_equal(image[0], images[number])
+        assert_array_equal(reference[0], references[number])
 
 
 @pytest.mark.parametrize(("kind", "full_scale"), [(np.uint8, 255), (np.uint16, 4095)])
@@ -67,8 +68,8 @@ def test_a_folder_holds_images_and_arrays(
     stored(tmp_path / "b.npy", array)
     (tmp_path / "notes.txt").write_text("of no matter")
     first, second = read_samples(tmp_path, 1, None).all.degraded
-    np.testing.assert_allclose(first[0, 0] * full_scale, pixels, atol=1e-3)
-    np.testing.assert_array_equal(second[0], array)
+    assert_allclose(first[0, 0] * full_scale, pixels, atol=1e-3)
+    assert_array_equal(second[0], array)
 
 
 def test_every_fourth_sample_is_held_out_from_calibration(tmp_path: Path) -> None:

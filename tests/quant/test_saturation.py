@@ -14,7 +14,7 @@ from beers_deploy.quant.structure import rounded_tensors, saturated_shares
 from tests.quant.simplify.networks import parsed
 from tests.shipped import shipped_pair
 
-IMAGE = np.random.default_rng(3).random((2, 1, 37, 43), dtype=np.float32)
+IMAGE = np.random.default_rng(3).random((2, 1, 37, 43), np.float32)
 Lost = Callable[[np.ndarray], np.ndarray]
 ENDS = "float[N,1,H,W] image => float[N,1,H,W] restored"
 

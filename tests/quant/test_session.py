@@ -31,7 +31,7 @@ def test_a_session_uses_no_cpu_time_after_its_run() -> None:
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_the_number_of_threads_changes_no_bit(threads: int) -> None:
-    image = np.random.default_rng(0).random((1, 1, 53, 71), dtype=np.float32)
+    image = np.random.default_rng(0).random((1, 1, 53, 71), np.float32)
     assert np.array_equal(
         run(open_session(shipped_pair()[1], threads), image),
         run(open_session(shipped_pair()[1]), image),

@@ -9,6 +9,7 @@ import onnx
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
 
 from beers_deploy.quant import graph as ops
 from beers_deploy.quant.core import build_core
@@ -82,9 +83,9 @@ def test_it_computes_the_bits_of_the_host_file(
     for optimise in (True, False):
         result = open_session(model, optimise=optimise).run(None, {PLANES: planes_of(image)})[0]
         expected = correction(core, core.host_part.encode(image), half_even=True)
-        np.testing.assert_array_equal(result, expected)
+        assert_array_equal(result, expected)
         by_host = run(open_session(host, optimise=optimise), image)
-        np.testing.assert_array_equal(core.host_part.finish(image, result), by_host)
+        assert_array_equal(core.host_part.finish(image, result), by_host)
 
 
 @NETWORKS

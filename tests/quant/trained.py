@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.graph import (
@@ -97,9 +98,9 @@ def assert_equals_reference(trainable: TrainableCore, planes: np.ndarray) -> Non
     correction = merged_correction(core, expected)
     for name, values in expected.items():
         if name != CORRECTION or decoding.copies == 1:
-            np.testing.assert_array_equal(tensors[name].numpy(), values, err_msg=name)
+            assert_array_equal(tensors[name].numpy(), values, err_msg=name)
     if decoding.copies == 1:
-        np.testing.assert_allclose(result, correction, rtol=1e-6)
+        assert_allclose(result, correction, rtol=1e-6)
         return
     sizes = np.split(np.abs(expected[CORRECTION]), decoding.copies, axis=1)
     fine_copies = [size for size, gain in zip(sizes, decoding.gains, strict=True) if gain == 1]

@@ -121,7 +121,6 @@ def failures(copy: Path) -> Failures:
         env={**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"},
         capture_output=True,
         text=True,
-        check=False,
     )
     if process.returncode not in (0, 1):
         raise SystemExit(process.stdout + process.stderr)

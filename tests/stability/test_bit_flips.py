@@ -8,6 +8,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.performance.swath import predict_network
@@ -98,11 +99,9 @@ def test_an_injection_leaves_the_target_alone(memory: str, target: FaultTarget) 
     injected = MEMORIES[memory].inject(target.core, image, 50_000, np.random.default_rng(0))
     assert injected.flips > 0
     assert not np.array_equal(restored(injected), fault_free)
-    np.testing.assert_array_equal(restored(injected), restored(injected))
-    np.testing.assert_array_equal(image, before)
-    np.testing.assert_array_equal(
-        restored(Injected(target.core, SOUND, target.pairs[0][0], 0)), fault_free
-    )
+    assert_array_equal(restored(injected), restored(injected))
+    assert_array_equal(image, before)
+    assert_array_equal(restored(Injected(target.core, SOUND, target.pairs[0][0], 0)), fault_free)
 
 
 def test_at_half_resolution_maps_have_8_bits_per_channel_and_place(coarse: Subject) -> None:

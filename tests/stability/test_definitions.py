@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.testing import assert_array_equal
 
 from beers_deploy.model.metrics.fidelity import SSIM_RADIUS_PX, SSIM_SIGMA_PX, ssim
 from beers_deploy.model.simulator.mtf import mtf
@@ -81,9 +82,9 @@ def test_both_files_hold_every_bias_at_its_scale(
     planes = IMAGE_SLICES.encode(image)
     expected = correction(core, planes, half_even=True)
     restored = np.clip(image + DualRange().decode(expected, core.scale(CORRECTION)), 0, 1)
-    np.testing.assert_array_equal(run(open_session(host_model(core, {})), image), restored)
+    assert_array_equal(run(open_session(host_model(core, {})), image), restored)
     feed = {PLANES: planes.astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
-    np.testing.assert_array_equal(open_session(board_model(core, {})).run(None, feed)[0], expected)
+    assert_array_equal(open_session(board_model(core, {})).run(None, feed)[0], expected)
 
 
 MTFS = st.floats(0.001, 0.63)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.instrument import MAX_DN
@@ -67,7 +68,7 @@ def test_exactly_the_given_number_of_bits_is_flipped(
     assert injected.dtype == values.dtype
     assert low <= injected.min() <= injected.max() < high
     repeated = flip_bits(values, count, np.random.default_rng(seed), bits)
-    np.testing.assert_array_equal(injected, repeated)
+    assert_array_equal(injected, repeated)
 
 
 def test_the_rate_is_per_million_bits() -> None:
@@ -89,7 +90,7 @@ def test_the_stored_bias_is_int8_and_the_network_the_same(quantized: Quantized) 
     before = run_core(quantized.core, planes)[0]
     after = run_core(stored, planes)[0]
     for name in before:
-        np.testing.assert_array_equal(before[name], after[name])
+        assert_array_equal(before[name], after[name])
 
 
 def test_flips_fall_into_the_weights_of_all_layers(core: IntCore) -> None:
@@ -141,9 +142,9 @@ def test_calibration_patches_pass_untouched(core: IntCore, guards: Guards) -> No
             run_core(core, IMAGE_SLICES.encode(image(seed=seed)), faults=f)[0]
             for f in (SOUND, guarded(SOUND, guards))
         )
-        np.testing.assert_array_equal(bare[CORRECTION], clamped[CORRECTION])
+        assert_array_equal(bare[CORRECTION], clamped[CORRECTION])
         correction = merged_correction(core, bare)
-        np.testing.assert_array_equal(guards.limit(correction), correction)
+        assert_array_equal(guards.limit(correction), correction)
 
 
 def test_guards_take_the_smallest_bound_above_the_calibration_peak(core: IntCore) -> None:
@@ -213,9 +214,7 @@ def test_a_wrong_shift_is_used(core: IntCore) -> None:
     shifts = shifts_of(core)
     planes = IMAGE_SLICES.encode(image(seed=2))
     faultless = run_core(core, planes)[0][CORRECTION]
-    np.testing.assert_array_equal(
-        run_core(core, planes, faults=Faults(shifts))[0][CORRECTION], faultless
-    )
+    assert_array_equal(run_core(core, planes, faults=Faults(shifts))[0][CORRECTION], faultless)
     for key in (key for key in shifts if key[1] == "shift_cut"):
         for wrong in (-32, 31):
             assert not np.array_equal(

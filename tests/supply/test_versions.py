@@ -52,7 +52,7 @@ def pip(python: Path, *words: object) -> subprocess.CompletedProcess[str]:
     # To compile the bytecode of all of SciPy takes longer than to install it.
     options = ("--quiet", "--disable-pip-version-check", "--no-compile", *map(str, words))
     return subprocess.run(
-        [python, "-m", "pip", "install", *options], capture_output=True, text=True, check=False
+        [python, "-m", "pip", "install", *options], capture_output=True, text=True
     )
 
 
@@ -143,7 +143,6 @@ def test_the_oldest_versions_run_the_main_commands(lowest: Path, folder: Path) -
         input=COMMANDS,
         capture_output=True,
         text=True,
-        check=False,
     )
     assert process.returncode == 0, process.stdout[-2000:] + process.stderr[-2000:]
 

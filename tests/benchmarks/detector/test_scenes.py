@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
 
 from beers_deploy.model.simulator.procedural import turn
 from beers_deploy.studies.detection.boxes import Boxes
@@ -82,6 +83,6 @@ def test_the_seed_decides_all() -> None:
     first, repeat, other = (
         synthetic_scene(np.random.default_rng(seed), 300, 300) for seed in (4, 4, 5)
     )
-    np.testing.assert_array_equal(first[0], repeat[0])
-    np.testing.assert_array_equal(first[1].corners, repeat[1].corners)
+    assert_array_equal(first[0], repeat[0])
+    assert_array_equal(first[1].corners, repeat[1].corners)
     assert first[0].tobytes() != other[0].tobytes()

@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 from beers_deploy.quant.onnx_file import load_onnx, metadata
 from beers_deploy.studies.detection.average_precision import find_hits, map50
@@ -54,11 +55,11 @@ def test_it_finds_unseen_squares_and_its_file_gives_the_same(
         with torch.inference_mode():
             boxes = Decoding(trained)(torch.from_numpy(image)).numpy()
         (result,) = session.run(["output0"], {"images": image})
-        np.testing.assert_allclose(result, boxes, rtol=1e-3, atol=1e-3)
+        assert_allclose(result, boxes, rtol=1e-3, atol=1e-3)
         for kind, corners in enumerate(unseen.corners):
             box = boxes[0, :4, boxes[0, 4 + kind].argmax()]
-            np.testing.assert_allclose(box[:2], (corners[:2] + corners[2:]) / 2, atol=3)
-            np.testing.assert_allclose(box[2:], corners[2:] - corners[:2], atol=5)
+            assert_allclose(box[:2], (corners[:2] + corners[2:]) / 2, atol=3)
+            assert_allclose(box[2:], corners[2:] - corners[:2], atol=5)
 
 
 def test_the_same_seed_gives_the_same_weights_and_another_gives_others() -> None:
@@ -77,7 +78,7 @@ def test_symmetries_move_the_boxes_with_the_image(seed: int) -> None:
     for kind, value in enumerate((255, 0)):
         rows, columns = np.nonzero(picture.image[0] == value)
         bounds = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
-        np.testing.assert_array_equal(picture.corners[kind], bounds)
+        assert_array_equal(picture.corners[kind], bounds)
 
 
 def test_the_stored_detector_states_our_classes_and_its_recipe() -> None:

@@ -147,7 +147,7 @@ def test_results_of_few_bands_become_an_image_and_scores_do_not(tmp_path: Path) 
 def test_what_the_host_computes_in_float_takes_time_in_both_files() -> None:
     """The INT8 file states it in its description, and the float file by its operators."""
     network = float_network("Tanh of the correction of the enlarged image")
-    raw = np.random.default_rng(0).random((1, 2, 40, 40), dtype=np.float32)
+    raw = np.random.default_rng(0).random((1, 2, 40, 40), np.float32)
     int8 = quickly(network, patches_of([raw])).host
     work = float_work(Network.load(int8))
     assert work == FloatWork(("nearest", "Tanh"), copies=2)

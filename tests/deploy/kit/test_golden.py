@@ -42,7 +42,7 @@ TILE_PX = 32
 def network(name: str) -> bd.Network:
     if name in SHIPPED:
         return bd.Network.load(name)
-    samples = np.random.default_rng(0).random((4, 1, 32, 32), dtype=np.float32)
+    samples = np.random.default_rng(0).random((4, 1, 32, 32), np.float32)
     normalised = name == NORMALISED
     name = name.partition(",")[0]
     with one_guess():

@@ -16,6 +16,7 @@ import onnx
 import pytest
 from cyclonedx.schema import SchemaVersion
 from cyclonedx.validation.json import JsonStrictValidator
+from numpy.testing import assert_allclose, assert_array_equal
 
 import beers_deploy as bd
 from beers_deploy.kit import RECORD
@@ -71,7 +72,7 @@ def behind_fitted_kernels() -> bd.Network:
 def with_host_end() -> bd.Network:
     """Return a network whose result the host crops and adds to the enlarged image."""
     network = float_network("Tanh, enlarged image, and a crop of the mirrored border")
-    raw = np.random.default_rng(0).random((1, 2, 40, 40), dtype=np.float32)
+    raw = np.random.default_rng(0).random((1, 2, 40, 40), np.float32)
     return bd.Network.load(quickly(network, patches_of([raw])).host)
 
 
@@ -93,7 +94,7 @@ def test_the_host_part_gives_the_host_files_bytes(name: str, tmp_path: Path) -> 
     int8 = own[name]() if name in own else network(name)
     folder = BOARD.kit(int8, tmp_path / "kit", tile=96)
     shape = int8.tiling.channels_in, 131, 203
-    image = np.random.default_rng(1).random(shape, dtype=np.float32)
+    image = np.random.default_rng(1).random(shape, np.float32)
     image = 2 * image - 1 if name == NORMALISED else image
     np.save(tmp_path / "image.npy", image)
     files = [str(tmp_path / "image.npy"), str(tmp_path / "out.npy")]
@@ -178,7 +179,7 @@ def test_the_host_part_refuses_what_it_cannot_restore(
     """
     np.save(tmp_path / "image.npy", image)
     command = [sys.executable, "host.py", str(tmp_path / "image.npy"), str(tmp_path / "out.npy")]
-    result = subprocess.run(command, cwd=kit, check=False, capture_output=True, text=True)
+    result = subprocess.run(command, cwd=kit, capture_output=True, text=True)
     assert result.returncode == 1
     assert words in result.stderr.splitlines(keepends=True)[-1]
     assert not (tmp_path / "out.npy").exists()
@@ -195,7 +196,7 @@ def test_the_host_part_restores_as_restore_does(
     """The host part runs both steps around the network, and each of them changes the image."""
     restored = partial(bd.restore, image, network=NAME, sensor=sensor, full_scale=1.0, force=True)
     by_kit = by_host(kit, image)
-    np.testing.assert_allclose(by_kit, restored(), rtol=0, atol=1e-6)
+    assert_allclose(by_kit, restored(), rtol=0, atol=1e-6)
     for without in (restored(exposure=False), restored(consistency=False)):
         assert np.abs(by_kit - without).max() > 0.001
 
@@ -227,7 +228,7 @@ def test_the_host_part_chooses_factors_and_corrects_as_the_library_does(
     radius_px = facts(kit)["halo_px"]
     factors = choose_factors(image, sorted(FACTORS), radius_px, 1.0, OFFSET_DN / 4095)
     assert {*np.unique(factors)} == FACTORS
-    np.testing.assert_array_equal(host["factors"](image[None, None]), factors)
+    assert_array_equal(host["factors"](image[None, None]), factors)
     restored = np.clip(image + np.random.default_rng(2).normal(0, 0.01, image.shape), 0, 1).astype(
         np.float32
     )
@@ -242,7 +243,7 @@ def test_the_host_part_chooses_factors_and_corrects_as_the_library_does(
             down, across = (Placed(side, 0, 0, side) for side in image.shape)
             change: np.ndarray = step.correction(raw, restored, down, across, (0, 0))
             expected = np.clip(restored + change, 0, 1)
-            np.testing.assert_array_equal(host["consistent"](raw, restored), expected)
+            assert_array_equal(host["consistent"](raw, restored), expected)
 
 
 def test_the_host_part_judges_blocks_as_the_library_does(
@@ -258,8 +259,8 @@ def test_the_host_part_judges_blocks_as_the_library_does(
     check = SelfCheck.of(sensor.nominal(), sensor.reference.nominal(), full_scale=1.0)
     sides = (Placed(side, 0, 0, side) for side in image.shape)
     expected = check.judge(image, np.load(kit / "out.npy")[0], *sides)
-    np.testing.assert_allclose(blocks[0, 0], expected.chi2, rtol=1e-3)
-    np.testing.assert_allclose(blocks[0, 1], expected.sharpening, rtol=1e-3)
+    assert_allclose(blocks[0, 0], expected.chi2, rtol=1e-3)
+    assert_allclose(blocks[0, 1], expected.sharpening, rtol=1e-3)
     host = runpy.run_path(str(kit / "host.py"))
     count = f"{expected.outside.sum()} of {expected.decidable.sum()} decidable blocks"
     assert count in host["report"](blocks)
@@ -353,7 +354,7 @@ def test_a_network_for_another_sensor_is_a_warning(
     other = bd.Network.load(NAME, sensor="dior-medium")
     with caplog.at_level(logging.WARNING, "beers_deploy"):
         BOARD.kit(other, tmp_path / "kit", tile=TILE_PX, sensor="pleiades-degraded")
-    (warning,) = (record.getMessage() for record in caplog.records)
+    (warning,) = caplog.messages
     assert "made for dior-medium, not for pleiades-degraded" in warning
 
 

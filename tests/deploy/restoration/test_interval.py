@@ -199,7 +199,7 @@ def test_other_weights_do_not_inherit_the_interval(tmp_path: Path) -> None:
     save_network(tmp_path / "w.safetensors", network, recipe)
     assert not read_weights(tmp_path / "w.safetensors").interval
     model = to_onnx(plain(Variant(1, 4)), {"interval": "of the float network"})
-    samples = np.random.default_rng(0).random((2, 1, 48, 48), dtype=np.float32)
+    samples = np.random.default_rng(0).random((2, 1, 48, 48), np.float32)
     with one_guess():
         int8 = bd.quantize(model, samples=samples)
     assert "interval" not in metadata(int8.model)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rasterio
+from numpy.testing import assert_allclose, assert_array_equal
 
 from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.verbs.restore import restore
@@ -113,7 +114,7 @@ def test_qgis_reads_what_was_written(qgis: Path, model: Path, tmp_path: Path) ->
     # QGIS applies the bands' gains.
     physical = sampled * np.reshape(layer["scales"], (-1, 1, 1))
     present = sampled > 0
-    np.testing.assert_allclose(np.asarray(layer["values"])[present], physical[present], rtol=1e-6)
+    assert_allclose(np.asarray(layer["values"])[present], physical[present], rtol=1e-6)
     assert layer["scales"] == [0.1, 0.2]
 
 
@@ -133,5 +134,5 @@ def test_qgis_s_toolbox_restores(qgis: Path, tmp_path: Path) -> None:
     assert "must have the name of a TIFF" in log
     restore(image, tmp_path / "expected.tif", network=shipped_pair(sensor=BLIND)[1])
     with rasterio.open(outs[0]) as ours, rasterio.open(tmp_path / "expected.tif") as theirs:
-        np.testing.assert_array_equal(ours.read(), theirs.read())
+        assert_array_equal(ours.read(), theirs.read())
         assert ours.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"

@@ -66,7 +66,7 @@ def restored() -> np.ndarray:
 
 
 def smoothed(image: np.ndarray) -> np.ndarray:
-    return np.rint(gaussian_filter(image.astype(np.float64), 1.0)).astype(np.uint16)
+    return np.asarray(np.rint(gaussian_filter(image.astype(np.float64), 1.0)), np.uint16)
 
 
 PROCESSED: dict[str, Callable[[np.ndarray], np.ndarray]] = {

@@ -229,7 +229,7 @@ def test_restores_where_torch_is_not_installed(image: Path, scheduler: str, tmp_
     options = f"--network convbeers-xs-int8 --scheduler {scheduler}".split()
     words = ("restore", str(image), str(out), *options)
     process = subprocess.run(
-        [sys.executable, "-c", WITHOUT_TORCH, *words], capture_output=True, text=True, check=False
+        [sys.executable, "-c", WITHOUT_TORCH, *words], capture_output=True, text=True
     )
     assert process.returncode == 0, process.stderr
     assert tifffile.imread(out).shape == tifffile.imread(image).shape

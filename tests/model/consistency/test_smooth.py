@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from beers_deploy.model.consistency.smooth import LIGHT, SMOOTH_PX, Smoothing
 from beers_deploy.profiles.effects import Offset
@@ -41,7 +42,7 @@ def test_a_smooth_step_and_bright_ground_stay() -> None:
     assert np.abs(smooth - step).max() < 0.03 * 10 * sigma_dn(DARK_DN)
     bright_dn = 1.2 * LIGHT * sigma_dn(200.0)
     bright = np.random.default_rng(1).normal(bright_dn, 1, (31, 27)).astype(np.float32)
-    np.testing.assert_array_equal(smoothing.smoothed(bright), bright)
+    assert_array_equal(smoothing.smoothed(bright), bright)
 
 
 def test_pixels_beside_missing_ones_stay() -> None:
@@ -52,5 +53,5 @@ def test_pixels_beside_missing_ones_stay() -> None:
     smooth = smoothing.smoothed(holed)
     reached = np.zeros(pixels.shape, bool)
     reached[17 - SMOOTH_PX : 20 + SMOOTH_PX, 30 - SMOOTH_PX : 31 + SMOOTH_PX] = True
-    np.testing.assert_array_equal(smooth[reached], holed[reached])
-    np.testing.assert_array_equal(smooth[~reached], smoothing.smoothed(pixels)[~reached])
+    assert_array_equal(smooth[reached], holed[reached])
+    assert_array_equal(smooth[~reached], smoothing.smoothed(pixels)[~reached])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
@@ -90,7 +91,7 @@ def test_any_part_is_corrected_as_the_whole_image_is_bit_for_bit(
         raw[some[0][::-1], some[1]] = FULL_SCALE
     uncut = corrected(step, raw, restored)
     part = corrected_in_part(step, raw, restored, (top, bottom, left, right))
-    np.testing.assert_array_equal(part, uncut[top:bottom, left:right])
+    assert_array_equal(part, uncut[top:bottom, left:right])
     assert np.isfinite(uncut).all()
 
 
@@ -233,7 +234,7 @@ def test_raw_values_of_missing_pixels_do_not_matter(value: float) -> None:
     raw[HOLE] = value
     with np.errstate(invalid="ignore"):
         after = corrected(step_for("formula"), raw, restored)
-    np.testing.assert_array_equal(after[around_hole(200)], before[around_hole(200)])
+    assert_array_equal(after[around_hole(200)], before[around_hole(200)])
     assert np.isfinite(before).all()
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from numpy.testing import assert_array_equal
 from PIL import Image
 
 from beers_deploy.model.raster.images import read_pixels
@@ -80,7 +81,7 @@ def test_a_codec_that_gdal_lacks_is_named(tmp_path: Path) -> None:
 def test_a_tile_that_no_memory_holds_is_refused(tmp_path: Path) -> None:
     data = zlib.compress(GREY.tobytes())
     honest = tiff(tmp_path / "a.tif", data, compression=8, tile_width=16, tile_height=16)
-    np.testing.assert_array_equal(read_pixels(honest), GREY)
+    assert_array_equal(read_pixels(honest), GREY)
     absurd = tiff(tmp_path / "b.tif", data, compression=8, tile_width=1 << 30, tile_height=1 << 30)
     refused(absurd, MachineError, "strips or tiles")
 
@@ -133,8 +134,8 @@ def test_other_files_that_a_microscopes_tiff_names_are_not_opened(tmp_path: Path
         "</Pixels></Image></OME>"
     )
     tifffile.imwrite(folder / "a.tif", GREY, description=xml, metadata=None)
-    np.testing.assert_array_equal(read_pixels(folder / "a.tif"), GREY)
-    np.testing.assert_array_equal(rows(folder / "a.tif")[0], GREY)
+    assert_array_equal(read_pixels(folder / "a.tif"), GREY)
+    assert_array_equal(rows(folder / "a.tif")[0], GREY)
 
 
 def test_a_file_that_is_no_png_or_jpeg_starts_no_other_program(

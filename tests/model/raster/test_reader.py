@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import rasterio
 import tifffile
+from numpy.testing import assert_array_equal
 from PIL import Image
 
 from beers_deploy.model.raster.reader import LEAST_CACHE_BYTES, open_raster
@@ -40,7 +41,7 @@ def assert_rows_equal(path: Path, expected: np.ndarray) -> None:
         for start, stop in ((0, 5), (3, 20), (12, 20), (19, 61), (60, 61), (0, 61), (30, 44)):
             rows = source.read(start, stop)
             assert rows.dtype == expected.dtype
-            np.testing.assert_array_equal(rows, bands[:, start:stop])
+            assert_array_equal(rows, bands[:, start:stop])
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
@@ -152,7 +153,7 @@ def test_envi_is_known_by_its_header(tmp_path: Path) -> None:
     for name in ("a.img", "b.bsq"):
         formats.write(tmp_path / name, pixels, "ENVI")
         with open_raster(tmp_path / name) as source:
-            np.testing.assert_array_equal(source.read(3, 9), pixels[:, 3:9])
+            assert_array_equal(source.read(3, 9), pixels[:, 3:9])
 
 
 def test_the_header_of_another_file_makes_no_envi_of_an_erdas_image(tmp_path: Path) -> None:
@@ -160,7 +161,7 @@ def test_the_header_of_another_file_makes_no_envi_of_an_erdas_image(tmp_path: Pa
     formats.write(tmp_path / "a.bsq", pixels + 1, "ENVI")
     formats.write(tmp_path / "a.img", pixels, "HFA")
     with open_raster(tmp_path / "a.img") as source:
-        np.testing.assert_array_equal(source.read(3, 9), pixels[:, 3:9])
+        assert_array_equal(source.read(3, 9), pixels[:, 3:9])
 
 
 def test_a_name_without_a_known_suffix_is_refused(tmp_path: Path) -> None:
@@ -186,7 +187,7 @@ def test_every_format_gives_its_rows(name: str, tmp_path: Path) -> None:
     with open_raster(formats.FORMATS[name](tmp_path / name, pixels)) as source:
         assert source.raster.shape == pixels.shape
         for start, stop in ((0, 7), (5, 70), (60, formats.HEIGHT), (0, formats.HEIGHT)):
-            np.testing.assert_array_equal(source.read(start, stop), pixels[:, start:stop])
+            assert_array_equal(source.read(start, stop), pixels[:, start:stop])
 
 
 def test_the_cache_is_counted_with_the_blocks_of_a_mosaic_s_tiles(

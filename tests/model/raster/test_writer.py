@@ -11,6 +11,7 @@ import pytest
 import rasterio
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
 from rasterio.enums import ColorInterp
 
 from beers_deploy.model.raster.compression import Compression
@@ -55,7 +56,7 @@ def test_every_type_and_compression_is_read_back(
     raster = Raster(bands, height_px, width_px, pixels.dtype, mask_kind=mask_kind)
     write_raster(path, raster, Masked(pixels), compression)
     with warnings.catch_warnings(action="ignore"), rasterio.open(path) as file:
-        np.testing.assert_array_equal(file.read()[:bands], pixels)
+        assert_array_equal(file.read()[:bands], pixels)
         # GDAL treats alpha as a mask only if there are one or three bands.
         is_alpha = file.colorinterp[-1] is ColorInterp.alpha
         missing = (file.read(bands + 1) if is_alpha else file.dataset_mask()) == 0
@@ -117,5 +118,5 @@ def test_a_small_image_is_read_back(tmp_path: Path) -> None:
     dn = np.arange(35, dtype=np.uint16).reshape(5, 7)
     write_tiff(tmp_path / "a.tif", dn)
     with warnings.catch_warnings(action="ignore"), rasterio.open(tmp_path / "a.tif") as file:
-        np.testing.assert_array_equal(file.read(1), dn)
+        assert_array_equal(file.read(1), dn)
         assert file.tags()["TIFFTAG_SOFTWARE"] == "beers-deploy"

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 from beers_deploy.model.simulator.acquire import prepare_scene, simulate_planned
 from beers_deploy.model.simulator.detector import (
@@ -130,7 +131,7 @@ def test_the_noise_is_the_same_whether_a_pattern_is_applied_or_not(name: str) ->
     sensor = stages.plain_sensor(dsnu=Dsnu(3.0), striping=Striping(2.0), offset=Offset(64.0))
     full = stages.before_digitising(radiance, sensor, 3, Draw(5))
     added = full - stages.before_digitising(radiance, sensor, 3, Draw(5), {name})
-    np.testing.assert_allclose(added, np.broadcast_to(added[:1], added.shape), atol=1e-3)
+    assert_allclose(added, np.broadcast_to(added[:1], added.shape), atol=1e-3)
     assert np.abs(added).min() > 0
 
 
@@ -192,13 +193,13 @@ def test_clipping_comes_before_the_cast() -> None:
 
 def test_integers_survive_a_round_trip() -> None:
     dn = np.arange(4096, dtype=np.float32)
-    np.testing.assert_array_equal(digitise(to_radiance(dn, SENSOR) * GAIN, SENSOR), dn, strict=True)
+    assert_array_equal(digitise(to_radiance(dn, SENSOR) * GAIN, SENSOR), dn, strict=True)
 
 
 def test_each_effect_has_its_own_draws() -> None:
     def numbers(draw: Draw, effect: str) -> np.ndarray:
         return draw.generator(effect).standard_normal(1000)
 
-    np.testing.assert_array_equal(numbers(Draw(3, 7), "a"), numbers(Draw(3, 7), "a"))
+    assert_array_equal(numbers(Draw(3, 7), "a"), numbers(Draw(3, 7), "a"))
     for other in (numbers(Draw(3, 7), "b"), numbers(Draw(3, 8), "a"), numbers(Draw(4, 7), "a")):
         assert abs(np.corrcoef(numbers(Draw(3, 7), "a"), other)[0, 1]) < 0.15

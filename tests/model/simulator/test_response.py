@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from beers_deploy.model.metrics.slanted_edge import edge_mtf, slanted_edge
 from beers_deploy.model.simulator.mtf import mtf, sensor_transfer, transfer_function
@@ -75,7 +76,7 @@ def test_a_table_of_the_formula_is_the_formula(contrasts: tuple[float, float], s
     fx = np.linspace(-3, 3, 61)[None]
     fy = np.linspace(-2, 2, 47)[:, None]
     table = stages.formula_table(*contrasts, steps)
-    np.testing.assert_allclose(mtf(fx, fy, table), mtf(fx, fy, contrasts), rtol=1e-9, atol=1e-14)
+    assert_allclose(mtf(fx, fy, table), mtf(fx, fy, contrasts), rtol=1e-9, atol=1e-14)
 
 
 @pytest.mark.parametrize("side", [64, 75])
@@ -104,7 +105,7 @@ def test_smear_multiplies_a_response_which_includes_the_antialias_filter(name: s
     transfer = transfer_function(30, 36, 3, blur, 0.0, 1.5)
     plain = transfer_function(30, 36, 3, blur)
     smear = np.sinc(1.5 * np.fft.fftfreq(30, 1 / 3))[:, None]
-    np.testing.assert_allclose(transfer, plain * smear, rtol=1e-5, atol=1e-7)
+    assert_allclose(transfer, plain * smear, rtol=1e-5, atol=1e-7)
     if not isinstance(blur, tuple):
         sensor = stages.with_response(stages.plain_sensor(antialias=AntiAlias(0.1)), blur)
         with pytest.raises(OptionError, match="anti-alias filter"):

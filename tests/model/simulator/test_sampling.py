@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 
 from beers_deploy.model.simulator.mtf import mtf, smear_response, transfer_function
 from beers_deploy.model.simulator.sampling import resample, sample, scene_of, scene_spectrum
@@ -77,7 +78,7 @@ def test_an_offset_moves_the_grid_over_the_scene(ratio: int) -> None:
     transfer = transfer_function(13 * ratio, 21 * ratio, ratio, 0.07)
     shifted = sample(scene_spectrum(radiance), transfer, 21 * ratio, ratio, offset_px=(2.0, -3.0))
     rolled = stages.blurred(np.roll(radiance, (-2, 3), (0, 1)), ratio, 0.07)
-    np.testing.assert_allclose(shifted, rolled, rtol=0, atol=1e-3)
+    assert_allclose(shifted, rolled, rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize("factor", [1, 16])
@@ -97,7 +98,7 @@ def test_a_stack_of_scenes_is_sampled_one_by_one() -> None:
     stack = sample(scene_spectrum(scenes), transfer, 63, 3)
     assert stack.shape == (3, 13, 21)
     for one, image in zip(scenes, stack, strict=True):
-        np.testing.assert_allclose(stages.blurred(one, 3, 0.07), image, rtol=0, atol=1e-4)
+        assert_allclose(stages.blurred(one, 3, 0.07), image, rtol=0, atol=1e-4)
 
 
 def wave(height: int, width: int, cycles: tuple[int, int]) -> np.ndarray:
@@ -113,11 +114,9 @@ def test_a_wave_that_both_grids_hold_is_the_same_wave(
     height: int, width: int, cycles: tuple[int, int]
 ) -> None:
     result = resample(wave(60, 84, cycles), height, width)
-    np.testing.assert_allclose(result, wave(height, width, cycles), rtol=0, atol=1e-3, strict=True)
+    assert_allclose(result, wave(height, width, cycles), rtol=0, atol=1e-3, strict=True)
 
 
 def test_frequencies_beyond_the_new_grid_are_cut_not_aliased() -> None:
     result = resample(wave(60, 84, (0, 30)), 40, 40)
-    np.testing.assert_allclose(
-        result, np.full((40, 40), 100.0, np.float32), rtol=0, atol=1e-3, strict=True
-    )
+    assert_allclose(result, np.full((40, 40), 100.0, np.float32), rtol=0, atol=1e-3, strict=True)

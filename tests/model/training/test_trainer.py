@@ -293,7 +293,6 @@ def test_two_workers_do_the_steps_of_one_with_a_batch_twice_as_large(tmp_path: P
         "capture_output": True,
         "text": True,
         "timeout": 240,
-        "check": False,
     }
     result = subprocess.run([*command, str(script), str(tmp_path / "two")], **options)
     assert result.returncode == 0, result.stderr[-2000:]

@@ -70,7 +70,7 @@ def shipped_core(name: str) -> IntCore:
 def planes_of(core: IntCore, tile_px: int) -> np.ndarray:
     """Return planes (2, P, H, W) of a tile: those of an image of noise, and the ends of int8."""
     shape = (1, core.host_part.image_channels, tile_px, tile_px)
-    image = np.random.default_rng(0).random(shape, dtype=np.float32)
+    image = np.random.default_rng(0).random(shape, np.float32)
     planes = core.host_part.encode(image)
     return np.concatenate([planes, extremes(planes.shape)[1:]])
 

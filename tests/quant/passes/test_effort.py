@@ -6,6 +6,7 @@ import re
 import numpy as np
 import onnx
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import host_model
@@ -40,7 +41,7 @@ def test_groups_of_channels_hold_each_channel_once_and_neighbours_in_range(
     groups = channel_groups(ranges, most)
     assert len(groups) == min(most, count)
     if most:
-        np.testing.assert_array_equal(np.sort(np.concatenate(groups)), np.arange(count))
+        assert_array_equal(np.sort(np.concatenate(groups)), np.arange(count))
     if 0 < most < count:
         widest = [ranges[group].max() for group in groups]
         narrowest = [ranges[group].min() for group in groups]
@@ -129,4 +130,4 @@ def test_running_only_changed_layers_gives_the_cost_of_running_all(
     quantize_model(float_onnx, patches_of(waves(2)), {}, effort=Effort.fast)
     assert len(costs_of_both) > 12
     for partial, whole in costs_of_both:
-        np.testing.assert_allclose(partial, whole, rtol=1e-6)
+        assert_allclose(partial, whole, rtol=1e-6)

@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from torch import Tensor, nn
 
 from beers_deploy.quant.graph import (
@@ -71,7 +72,7 @@ def test_the_float_network_is_unchanged_even_at_the_border(
     assert len(split) == len(graph) + 3
     (before,) = run(graph, [CORRECTION], channels)
     (after,) = run(split, [CORRECTION], channels)
-    np.testing.assert_allclose(after, before, atol=2e-5 * np.abs(before).max())
+    assert_allclose(after, before, atol=2e-5 * np.abs(before).max())
 
 
 def test_the_sum_no_longer_follows_the_brightness_of_the_ground() -> None:
@@ -81,7 +82,7 @@ def test_the_sum_no_longer_follows_the_brightness_of_the_ground() -> None:
     for level in (0.1, 0.9):
         planes = np.full((1, 3, 9, 9), level, np.float32)
         inner.append(session.run(None, {PLANES: planes})[0][..., 2:-2, 2:-2])
-    np.testing.assert_allclose(inner[0], inner[1], atol=1e-4)
+    assert_allclose(inner[0], inner[1], atol=1e-4)
 
 
 def test_a_head_that_nothing_else_reads_is_replaced() -> None:
@@ -91,7 +92,7 @@ def test_a_head_that_nothing_else_reads_is_replaced() -> None:
     assert "head" not in {op.output for op in split}
     (before,) = run(graph, [CORRECTION])
     (after,) = run(split, [CORRECTION])
-    np.testing.assert_allclose(after, before, atol=2e-4)
+    assert_allclose(after, before, atol=2e-4)
 
 
 def graphs_without_long_skip() -> dict[str, Graph]:
@@ -160,7 +161,7 @@ def assert_pixel_is_exact(int8: Quantized) -> None:
     tensors, _ = run_core(int8.core, planes)
     coarse, remainder, _ = planes[0].astype(np.int16)
     (name,) = (name for name in tensors if name.endswith(".pixel"))
-    np.testing.assert_array_equal(tensors[name][0], [coarse, 4 * remainder])
+    assert_array_equal(tensors[name][0], [coarse, 4 * remainder])
     assert tensors[name].max() == 127
     counted = saturated_shares(int8.host, [every_dn])
     assert counted

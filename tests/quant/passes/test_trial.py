@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 from beers_deploy.quant.graph import CORRECTION, PLANES, Conv, same
 from beers_deploy.quant.host_part import HostPart
@@ -19,11 +20,11 @@ def test_bright_ground_has_the_details_of_its_crop(
     crop = ends * np.random.default_rng(seed).uniform(0, 0.5, (1, 3, 6, 11)).astype(np.float32)
     crop[:, 2] = 0.1
     bright = brightened(crop.astype(np.float32), ranges)
-    np.testing.assert_allclose(bright[:, :2].max((0, 2, 3)), ends[:2, 0, 0], rtol=1e-5)
+    assert_allclose(bright[:, :2].max((0, 2, 3)), ends[:2, 0, 0], rtol=1e-5)
     lift = bright - crop
-    np.testing.assert_allclose(lift, np.broadcast_to(lift[..., :1, :1], lift.shape), atol=1e-4)
+    assert_allclose(lift, np.broadcast_to(lift[..., :1, :1], lift.shape), atol=1e-4)
     # A map of a noise level does not depend on the ground's brightness.
-    np.testing.assert_array_equal(bright[:, 2], crop[:, 2].astype(np.float32))
+    assert_array_equal(bright[:, 2], crop[:, 2].astype(np.float32))
 
 
 @pytest.mark.parametrize("brightens", [True, False])

@@ -7,6 +7,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
@@ -192,7 +193,7 @@ def test_the_file_matches_its_integers_and_the_reference(conditioned: Conditione
     host_part = core_again.host_part
     tensors, _ = run_core(core_again, host_part.encode(image), half_even=True)
     mine = host_part.finish(image, merged_correction(core_again, tensors))
-    np.testing.assert_allclose(mine, run(open_session(file), image), atol=1e-7)
+    assert_allclose(mine, run(open_session(file), image), atol=1e-7)
 
 
 def test_a_sensor_changes_the_first_layer_biases_and_the_unit_alone(
@@ -308,7 +309,7 @@ def test_tiles_give_the_whole_images_result(pair: Pair) -> None:
         read = image[..., above : top + 32 + halo, before : left + 32 + halo]
         tile = run(session, np.ascontiguousarray(read))[..., top - above :, left - before :]
         expected = at_once[..., top : top + 32, left : left + 32]
-        np.testing.assert_array_equal(tile[..., :32, :32], expected)
+        assert_array_equal(tile[..., :32, :32], expected)
 
 
 def test_no_image_leaves_the_bounds_that_are_proven(conditioned: ConditionedCore) -> None:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 from beers_deploy.model.bank import FILTERS, SIDE_PX, UNIT_STEPS, WIDE, Bank, bank_of_vector
 from beers_deploy.model.variants import Kernels
@@ -57,7 +58,7 @@ def test_the_response_to_flat_ground_is_its_brightness_alone(
     flat = np.full((1, 1, SIDE_PX, SIDE_PX), dn / MAX_DN, np.float32)
     own = bank_of_vector(vector)
     response = sums(flat, own)[0, :, 0, 0]
-    np.testing.assert_array_equal(response[COPIES[0] :], 0)
+    assert_array_equal(response[COPIES[0] :], 0)
     assert abs(response[0] - (dn - BANK_SLICES.middle) * own.gain / IMAGE_STEP_DN) <= 0.5 * own.gain
 
 
@@ -103,7 +104,7 @@ def test_copies_are_rounded_at_offsets_spread_over_a_step() -> None:
     for kernels, count in counts.items():
         offsets = [offset for kernel, offset in channels(kernels) if kernel == 1 + FILTERS]
         assert len(offsets) == count
-        np.testing.assert_allclose(np.diff(offsets), 1 / count)
+        assert_allclose(np.diff(offsets), 1 / count)
         assert sum(offsets) == pytest.approx(0)
 
 
@@ -125,4 +126,4 @@ def test_at_half_resolution_the_same_filters_read_the_same_pixels() -> None:
         .transpose(2, 0, 3, 1)
         .reshape(expected.shape)
     )
-    np.testing.assert_array_equal(mine, expected)
+    assert_array_equal(mine, expected)

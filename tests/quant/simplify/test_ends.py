@@ -8,6 +8,7 @@ import onnx
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from onnx.reference import ReferenceEvaluator
 
 from beers_deploy.quant.graph import read_network, refusal
@@ -41,7 +42,7 @@ def test_a_network_of_channels_last_becomes_one_of_channels_first() -> None:
     onnx.checker.check_model(short, full_check=True)
     before = run_model(model, np.moveaxis(IMAGE, 1, 3))
     after = run_model(short, IMAGE)
-    np.testing.assert_allclose(np.moveaxis(after, 1, 3), before, rtol=1e-5)
+    assert_allclose(np.moveaxis(after, 1, 3), before, rtol=1e-5)
 
 
 PARTS = (
@@ -91,7 +92,7 @@ def test_channels_that_are_last_between_other_layers_become_first(
     assert "Transpose" not in {n.op_type for n in short.graph.node}
     image = 1 + IMAGE
     before = run_model(model, np.moveaxis(image, 1, 3) if image_last else image)
-    np.testing.assert_allclose(run_model(short, image), before, rtol=1e-4)
+    assert_allclose(run_model(short, image), before, rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +112,7 @@ def test_pads_of_channels_last_may_name_their_axes(axes: list[int], pads: list[i
     # onnxruntime moves such a Transpose and leaves the axes as they were, which is wrong, so that
     # ONNX's reference gives the expected result.
     (before,) = ReferenceEvaluator(model).run(None, {"x": IMAGE})
-    np.testing.assert_allclose(run_model(short, IMAGE), np.asarray(before), rtol=1e-4)
+    assert_allclose(run_model(short, IMAGE), np.asarray(before), rtol=1e-4)
 
 
 def test_pads_that_follow_from_an_even_size_are_stated() -> None:
@@ -143,7 +144,7 @@ def test_the_image_of_a_network_without_padding_is_mirrored(layers: int, is_fixe
     inner = run_model(short, IMAGE)
     assert inner.shape[2:] == IMAGE.shape[2:]
     inner = inner[:, :, layers:-layers, layers:-layers]
-    np.testing.assert_allclose(inner, run_model(model, IMAGE), rtol=1e-4)
+    assert_allclose(inner, run_model(model, IMAGE), rtol=1e-4)
 
 
 def test_a_network_that_pools_over_the_image_gets_no_border() -> None:

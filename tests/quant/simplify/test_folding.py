@@ -10,6 +10,7 @@ import onnx
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from onnx import TensorProto, helper
 
 from beers_deploy.float_onnx import to_onnx
@@ -39,7 +40,7 @@ def folded(model: onnx.ModelProto, atol: float = 2e-5) -> dict[str, int]:
     short = simplify(model, "a.onnx")
     onnx.checker.check_model(short)
     for before, after in zip(results(model), results(short), strict=True):
-        np.testing.assert_allclose(after, before, rtol=2e-5, atol=atol)
+        assert_allclose(after, before, rtol=2e-5, atol=atol)
         assert before.std() > 0.01
     return kinds(short)
 
@@ -86,7 +87,7 @@ def test_channelwise_operators_are_folded_into_convolutions(parts: list[str]) ->
     border_px = max((after.shape[2] - before.shape[2]) // 2, 0)
     after = after[:, :, border_px : after.shape[2] - border_px, border_px:]
     after = after[..., : before.shape[3]]
-    np.testing.assert_allclose(after, before, rtol=0, atol=1e-5 * max(np.abs(before).max(), 1))
+    assert_allclose(after, before, rtol=0, atol=1e-5 * max(np.abs(before).max(), 1))
     kind = dict[str, str]()
     for n in short.graph.node:
         kind |= dict.fromkeys(n.output, n.op_type)
@@ -208,4 +209,4 @@ def test_an_integer_image_input_becomes_float(front: str, kind: str) -> None:
     image = np.random.default_rng(0).integers(0, 255, (1, CHANNELS, 9, 11))
     (before,) = open_session(model).run(None, {"x": image.astype(kind)})
     (after,) = open_session(short).run(None, {"x": image.astype(np.float32)})
-    np.testing.assert_allclose(after, before, rtol=2e-5, atol=1e-3)
+    assert_allclose(after, before, rtol=2e-5, atol=1e-3)

@@ -6,6 +6,7 @@ import numpy as np
 import onnx
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 
 from beers_deploy.quant.graph import read_network, refusal
 from beers_deploy.quant.onnx.graph import OnnxGraph
@@ -34,7 +35,7 @@ def assert_same(model: onnx.ModelProto, short: onnx.ModelProto, rows: int, colum
     before = run_model(model, pixels)
     after = run_model(short, pixels)
     largest = np.abs(before).max()
-    np.testing.assert_allclose(after, before, atol=1e-5 * largest)
+    assert_allclose(after, before, atol=1e-5 * largest)
 
 
 def pairs(low: int, high: int) -> st.SearchStrategy[tuple[int, int]]:
@@ -160,4 +161,4 @@ def test_a_u_net_without_padding_crops_its_skip_and_gets_a_mirrored_border() -> 
     expected = run_model(model, pixels)
     whole = run_model(short, pixels)
     inner = whole[:, :, 6:-6, 6:-6]
-    np.testing.assert_allclose(inner, expected, atol=1e-5)
+    assert_allclose(inner, expected, atol=1e-5)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
@@ -143,15 +144,15 @@ def test_a_weight_counts_like_as_many_copies_for_pycocotools(
     number = list(SIZES_PX).index(size)
     ours = [precisions(hits, kind, images, number, 10)[0].mean(axis=-1) for kind in range(3)]
     expected = by_pycocotools(copies, size)
-    np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-12)
+    assert_allclose(ours, expected, rtol=0, atol=1e-12)
     for name, value in scored(copies, NAMES, 0.5).items():
-        np.testing.assert_allclose(figures[name][0], value, rtol=0, atol=1e-12, err_msg=name)
+        assert_allclose(figures[name][0], value, rtol=0, atol=1e-12, err_msg=name)
     mean = mean_known(expected[:, :1])[0]
     of_size = figures["mAP50" if size == "all" else f"mAP50 {size}"][0]
-    np.testing.assert_allclose(of_size, mean, rtol=0, atol=1e-12)
+    assert_allclose(of_size, mean, rtol=0, atol=1e-12)
     if size == "all":
         mean = mean_known(expected.mean(axis=1)[:, None])[0]
-        np.testing.assert_allclose(figures["mAP50-95"][0], mean, rtol=0, atol=1e-12)
+        assert_allclose(figures["mAP50-95"][0], mean, rtol=0, atol=1e-12)
 
 
 @settings(max_examples=30)
@@ -173,7 +174,7 @@ def test_precision_and_recall_are_those_of_what_is_left_at_a_confidence(
             recall.append(true_positives / objects)
     expected = [np.mean(values or np.nan) for values in (precision, recall)]
     actual = [figures["precision"], figures["recall"]]
-    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-12)
+    assert_allclose(actual, expected, rtol=0, atol=1e-12)
 
 
 def test_sizes_are_distinguished_by_the_root_of_the_area() -> None:
@@ -209,7 +210,7 @@ def test_a_draw_has_whole_sites_and_a_seed_gives_the_same_draws() -> None:
     assert weights[0].tolist() == [1, 1, 1, 1]
     assert (weights[:, 0] == weights[:, 1]).all()
     assert (weights[1:, 1:].sum(axis=1) == 3).all()
-    np.testing.assert_array_equal(weights, site_weights(["a", "a", "b", "c"], 5, 200))
+    assert_array_equal(weights, site_weights(["a", "a", "b", "c"], 5, 200))
     assert not np.array_equal(weights, site_weights(["a", "a", "b", "c"], 6, 200))
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.studies.detection.boxes import OVERLAP, Boxes, Letterbox, iou, suppress
@@ -33,7 +34,7 @@ def test_suppression_leaves_the_best_of_each_cluster(seed: int) -> None:
         & (candidates.classes[:, None] == survivors.classes)
         & (candidates.scores[:, None] < survivors.scores)
     ).any(axis=1)
-    np.testing.assert_array_equal(crowded, ~np.isin(candidates.scores, survivors.scores))
+    assert_array_equal(crowded, ~np.isin(candidates.scores, survivors.scores))
 
 
 def test_suppression_keeps_the_best_and_no_more_than_300() -> None:
@@ -63,7 +64,7 @@ def test_the_letterbox_maps_pixels_and_boxes_to_the_same_place(
     inside = np.abs(pixels[2] - 0.5) < 1e-3
     rows, columns = np.nonzero(inside)
     edges = np.array([[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]])
-    np.testing.assert_allclose(box.to_image(edges), [[0, 0, width, height]], atol=1e-6)
+    assert_allclose(box.to_image(edges), [[0, 0, width, height]], atol=1e-6)
     middles = box.to_image(np.stack([columns, rows, columns, rows], axis=1) + 0.5)
     # Between the middles of the outermost pixels: at the border it can only repeat the last one.
     x_px, y_px = np.clip(middles[:, :2], 0.5, np.array([width, height]) - 0.5).T

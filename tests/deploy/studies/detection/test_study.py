@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from beers_deploy.model.io.pictures import stretch_of
 from beers_deploy.model.simulator.detector import Draw
@@ -71,7 +72,7 @@ def test_boxes_are_mapped_back_to_the_object(
     boxes = acquisition.boxes(Detector(NAMES, 128, "", bright), None)
     assert iou(boxes.corners, np.array([corners], float))[0, 0] > 0.75
     middle = (boxes.corners[0, :2] + boxes.corners[0, 2:]) / 2
-    np.testing.assert_allclose(middle, (np.array(corners[:2]) + corners[2:]) / 2, atol=0.6 * ratio)
+    assert_allclose(middle, (np.array(corners[:2]) + corners[2:]) / 2, atol=0.6 * ratio)
 
 
 def test_all_rows_are_shown_under_the_stretch_of_the_reference() -> None:
@@ -82,7 +83,7 @@ def test_all_rows_are_shown_under_the_stretch_of_the_reference() -> None:
         (acquisition.reference, None),
         (acquisition.degraded, Method("degraded", lambda dn: dn, "known")),
     ):
-        np.testing.assert_array_equal(acquisition.shown(method), stretch.to_srgb(dn))
+        assert_array_equal(acquisition.shown(method), stretch.to_srgb(dn))
 
 
 def handmade(sites: int = 12, **counts: int) -> Comparison:
