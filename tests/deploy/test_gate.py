@@ -8,7 +8,6 @@ import onnx
 import onnxruntime as ort
 import pytest
 from onnx import numpy_helper
-from onnxruntime.quantization import quantize_static
 
 import beers_deploy as bd
 from beers_deploy.float_onnx import float_model
@@ -26,7 +25,7 @@ from beers_deploy.quant.session import open_session
 from beers_deploy.quant.structure import Relus, count_relus, rounded_tensors, saturated_shares
 from beers_deploy.verdict import file_checks
 from tests.deploy.command_line import done, refused
-from tests.quant.quick import Calibration, change, changed, drawn
+from tests.quant.quick import change, changed, drawn, quantized_freely
 from tests.shipped import shipped_pair
 
 Corrupt = Callable[[onnx.ModelProto], object]
@@ -220,10 +219,8 @@ def test_results_that_are_never_below_zero_need_no_relu() -> None:
 def test_a_file_of_another_quantizer_is_judged_without_the_rules_of_a_dpu(
     model: Path, tmp_path: Path
 ) -> None:
-    path = tmp_path / "free.onnx"
+    path = quantized_freely(model, tmp_path / "free.onnx", per_channel=True)
     reference_model = load_onnx(model)
-    noise = list(np.random.default_rng(0).random((2, 1, 1, 32, 32), np.float32))
-    quantize_static(model, path, Calibration(noise), per_channel=True)
     free = Network(onnx.load(path), "free", path)
     checks = file_checks(reference_model, free, TargetProfile.load("host-cpu"))
     assert [(c.name, c.passed) for c in checks] == [

@@ -2,6 +2,10 @@
 
 from pathlib import Path
 
+from beers_deploy.profiles.constant import Stated
+from beers_deploy.profiles.response import MtfTable
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import axes_of
 from beers_deploy.profiles.shipped import HERE
 
 SHIPPED = (HERE / "sensors" / "pleiades-degraded.toml").read_text(encoding="utf-8")
@@ -21,3 +25,10 @@ def own_sensor(folder: Path, *changes: tuple[str, str], text: str | None = None)
     path = folder / "mine.toml"
     path.write_text(edited(*changes) if text is None else text, encoding="utf-8")
     return path
+
+
+def departing(sensor: Sensor) -> Sensor:
+    """Return a sensor with a table whose MTF departs from the formula's curve."""
+    table = MtfTable((0.0, 0.25, 0.5), (1.0, 0.6, 0.1), (1.0, 0.6, 0.1))
+    about = Stated(table, "stated", "for a test")
+    return sensor.with_fields(response=table, **axes_of(table, about, about))

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 import onnx
 from onnx import numpy_helper
-from onnxruntime.quantization import CalibrationDataReader
+from onnxruntime.quantization import CalibrationDataReader, quantize_static
 
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles.sensor import Sensor
@@ -159,3 +160,10 @@ class Calibration(CalibrationDataReader):  # type: ignore[misc]  # onnxruntime h
 
     def get_next(self) -> dict[str, np.ndarray] | None:
         return next(({"image": image} for image in self._images), None)
+
+
+def quantized_freely(source: Path, path: Path, **options: Any) -> Path:
+    """Write a float network to `path` as onnxruntime quantises it, calibrated on noise."""
+    noise = list(np.random.default_rng(0).random((2, 1, 1, 32, 32), np.float32))
+    quantize_static(source, path, Calibration(noise), **options)
+    return path

@@ -1,18 +1,16 @@
 """A file that hides a float network around an integer core does not pass as INT8."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
 import pytest
 from numpy.typing import ArrayLike
-from onnxruntime.quantization import quantize_static
 
 from beers_deploy.quant.float_parts import float_layers_check, float_note
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.structure import structure_checks
-from tests.quant.quick import Calibration
+from tests.quant.quick import quantized_freely
 from tests.quant.simplify.networks import parsed
 from tests.shipped import shipped_pair
 
@@ -61,8 +59,11 @@ def test_a_file_of_ours_has_none(name: str) -> None:
 def test_a_file_of_another_quantizer_has_none(
     per_channel: bool, float_onnx: onnx.ModelProto, tmp_path: Path
 ) -> None:
-    free = quantized_freely(float_onnx, tmp_path, per_channel=per_channel)
-    assert float_layers_check(free).passed
+    save_onnx(float_onnx, tmp_path / "float.onnx")
+    free = quantized_freely(
+        tmp_path / "float.onnx", tmp_path / "free.onnx", per_channel=per_channel
+    )
+    assert float_layers_check(load_onnx(free)).passed
 
 
 def test_one_float_layer_is_reported(tmp_path: Path) -> None:
@@ -75,15 +76,9 @@ def test_one_float_layer_is_reported(tmp_path: Path) -> None:
         "float[N,1,H,W] image => float[N,1,H,W] y",
         constants={name: generator.normal(0, 0.2, shape) for name, shape in shapes.items()},
     )
-    partly = quantized_freely(model, tmp_path, nodes_to_exclude=["kept"])
-    checks = {check.name: check for check in structure_checks(model, partly)}
+    save_onnx(model, tmp_path / "float.onnx")
+    partly = quantized_freely(
+        tmp_path / "float.onnx", tmp_path / "free.onnx", nodes_to_exclude=["kept"]
+    )
+    checks = {check.name: check for check in structure_checks(model, load_onnx(partly))}
     assert not checks["layers computed in float"].passed
-
-
-def quantized_freely(model: onnx.ModelProto, folder: Path, **options: Any) -> onnx.ModelProto:
-    """Return a network as onnxruntime quantises it."""
-    save_onnx(model, folder / "float.onnx")
-    noise = list(np.random.default_rng(0).random((2, 1, 1, 32, 32), np.float32))
-    path = folder / "free.onnx"
-    quantize_static(folder / "float.onnx", path, Calibration(noise), **options)
-    return load_onnx(path)

@@ -1,6 +1,6 @@
 """Small ONNX files built node by node, for the tests of the checker and the cost model."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -181,3 +181,9 @@ class QdqSketch(Sketch):
         kernel = self.stored(np.ones((4, channels, 3, 3), weight_kind), weight)
         start = self.stored(np.ones(4, bias_kind), bias)
         return self.pair(self.node("Conv", source, kernel, start, pads=[1] * 4), output)
+
+
+def behind_qdq_conv(path: Path, draw: Callable[[QdqSketch, str], str]) -> Path:
+    """Write a network with `draw` behind a convolution."""
+    sketch = QdqSketch(4)
+    return sketch.save(path, draw(sketch, sketch.qdq_conv(sketch.pair("image"))))

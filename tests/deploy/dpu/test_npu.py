@@ -18,7 +18,7 @@ from beers_deploy.profiles.shipped import board_names
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import figures_of, valid
 from tests.deploy.dpu.draws import rules_of
-from tests.deploy.dpu.graphs import QdqSketch
+from tests.deploy.dpu.graphs import QdqSketch, behind_qdq_conv
 from tests.model.networks import plain
 
 Draw = Callable[[QdqSketch, str], str]
@@ -52,8 +52,7 @@ def biased(size: int) -> Draw:
 
 def write_network(path: Path, draw: Draw, opset: int = 17, side: int | None = 31) -> Path:
     """Write a file with `draw` behind a convolution, for images of `side` or of any size."""
-    sketch = QdqSketch(4)
-    model = onnx.load(sketch.save(path, draw(sketch, sketch.qdq_conv(sketch.pair("image")))))
+    model = onnx.load(behind_qdq_conv(path, draw))
     model.opset_import[0].version = opset
     for value in (*model.graph.input, *model.graph.output) if side else ():
         for dim, size in zip(value.type.tensor_type.shape.dim, (1, 4, side, side), strict=True):

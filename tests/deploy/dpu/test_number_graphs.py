@@ -13,7 +13,7 @@ from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.number_rules import AGAIN, MOVE
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.reading import read_network
-from tests.deploy.dpu.graphs import QdqSketch
+from tests.deploy.dpu.graphs import QdqSketch, behind_qdq_conv
 
 DPU = load_dpu("vck190")
 Draw = Callable[[QdqSketch, str], str]
@@ -88,9 +88,7 @@ CASES: dict[str, tuple[Draw, Draw]] = {
 
 def remedies(path: Path, draw: Draw) -> dict[str, str]:
     """Return the rules that `draw` behind a convolution breaks, with their remedies."""
-    sketch = QdqSketch(4)
-    end = draw(sketch, sketch.qdq_conv(sketch.pair("image")))
-    nodes = place(read_network(sketch.save(path, end), 32), DPU).nodes
+    nodes = place(read_network(behind_qdq_conv(path, draw), 32), DPU).nodes
     by_rule: dict[str, str] = {}
     for node in nodes:
         by_rule |= {violation.rule: violation.finding.remedy for violation in node.broken}

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
+from onnxruntime.quantization import QuantFormat, QuantType
 
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import Placement, place
 from beers_deploy.dpu.reading import read_network
 from tests.deploy.dpu.draws import rules_of
 from tests.deploy.dpu.graphs import Sketch
-from tests.quant.quick import Calibration
+from tests.quant.quick import quantized_freely
 
 DPU = load_dpu("vck190")
 TILE_PX = 34
@@ -48,18 +48,15 @@ def quantized(
     per_channel: bool = False,
     symmetric: bool = False,
 ) -> Path:
-    noise = list(np.random.default_rng(0).random((2, 1, 1, TILE_PX, TILE_PX), np.float32))
-    quantize_static(
+    return quantized_freely(
         float_file(path.with_name("f.onnx")),
         path,
-        Calibration(noise),
         quant_format=form,
         per_channel=per_channel,
         activation_type=kind,
         weight_type=QuantType.QInt8,
         extra_options={"ActivationSymmetric": symmetric},
     )
-    return path
 
 
 def rules(placement: Placement) -> set[str]:

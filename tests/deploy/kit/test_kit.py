@@ -30,17 +30,14 @@ from beers_deploy.model.exposure import choose_factors, exposures_for
 from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.self_check import SelfCheck
 from beers_deploy.model.variants import Variant
-from beers_deploy.profiles.constant import Stated
 from beers_deploy.profiles.errors import MachineError, OptionError, ProfileError
-from beers_deploy.profiles.response import MtfTable
-from beers_deploy.profiles.sensor_file import axes_of
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.sensor_bank.calibrate import bank_results, quantize_behind_bank
 from beers_deploy.quant.session import open_session, tensors_of
 from tests.deploy.command_line import done
 from tests.deploy.kit.test_golden import NORMALISED, network
 from tests.model.networks import behind_a_bank
-from tests.profiles.own_sensor import edited, own_sensor
+from tests.profiles.own_sensor import departing, edited, own_sensor
 from tests.quant.quick import patches_of, quickly
 from tests.quant.sensor_bank.test_filters import textured
 from tests.quant.test_host_end import float_network
@@ -232,13 +229,11 @@ def test_the_host_part_chooses_factors_and_corrects_as_the_library_does(
     restored = np.clip(image + np.random.default_rng(2).normal(0, 0.01, image.shape), 0, 1).astype(
         np.float32
     )
-    table = MtfTable((0.0, 0.25, 0.5), (1.0, 0.6, 0.1), (1.0, 0.6, 0.1))
-    about = Stated(table, "stated", "for a test")
-    departing = sensor.with_fields(response=table, **axes_of(table, about, about))
-    for profile in (sensor, departing):
+    other = departing(sensor)
+    for profile in (sensor, other):
         host["S"]["consistency"] = consistency_facts(bd.Network.load(NAME), profile)
         step = Consistency.of(profile.nominal(), profile.reference.nominal(), full_scale=1.0)
-        assert (step.detail is not None) == (profile is departing)
+        assert (step.detail is not None) == (profile is other)
         for raw in (image, np.minimum(image, np.float32(0.95))):
             down, across = (Placed(side, 0, 0, side) for side in image.shape)
             change: np.ndarray = step.correction(raw, restored, down, across, (0, 0))

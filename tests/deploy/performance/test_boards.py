@@ -21,20 +21,24 @@ from beers_deploy.performance import traditional
 from beers_deploy.performance.board import Bench, Question, bench_board, boards_for
 from beers_deploy.performance.swath import Swath
 from beers_deploy.performance.tables import sweep_rows, within_words
-from beers_deploy.profiles.constant import Stated
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.response import MtfTable
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import axes_of
 from beers_deploy.profiles.shipped import board_names, npu_names
 from tests.deploy.dpu.graphs import integer_convbeers
+from tests.profiles.own_sensor import departing
 
 
 def bench(model: Path, target: str = "vck190", **options: Any) -> Bench:
     """Predict a small swath in small tiles; the traditional pipeline is not measured."""
     usual: dict[str, Any] = {"size": "300x260", "tile": 128, "traditional": False}
     return bd.bench(model, target=target, **{**usual, **options})
+
+
+def question(size: tuple[int, int] | None = None) -> Question:
+    """Return the question of one board, with the consistency step, in tiles of 128 pixels."""
+    boards, _ = boards_for(boards_of("vck190"), None, None)
+    return Question(boards, [], size, [128], "exact", None, None, consistency=True)
 
 
 @pytest.fixture(scope="module")
@@ -171,10 +175,8 @@ def test_the_exposures_of_an_image_are_counted_whatever_the_bits_of_the_sensor(
     # These pixels are dark enough for x16, also far from bright ground.
     pixels[:, :128] = 200
     tifffile.imwrite(tmp_path / "image.tif", pixels)
-    boards, _ = boards_for(boards_of("vck190"), None, None)
-    question = Question(boards, [], None, [128], "exact", None, None, consistency=True)
     dn = read_acquisition(tmp_path / "image.tif", 4095, None)
-    result = bench_board(Network.load(network), question, dn, sensor)
+    result = bench_board(Network.load(network), question(), dn, sensor)
     (words,) = (note for note in result.notes if "by exposure" in note)
     shares = dict(re.findall(r"(x\d+) (\d+)%", words))
     assert shares.keys() == {"x1", "x4", "x16"}
@@ -196,15 +198,10 @@ def test_a_file_for_every_sensor_has_the_exposures_of_its_name(tmp_path: Path) -
 
 def test_a_curve_of_another_shape_takes_the_host_longer(network: Path) -> None:
     """Where the MTF departs from the formula's curve the consistency step corrects detail too."""
-    table = MtfTable((0.0, 0.25, 0.5), (1.0, 0.6, 0.1), (1.0, 0.6, 0.1))
     sensor = Sensor.load("pleiades-degraded")
-    about = Stated(table, "stated", "for a test")
-    departing = sensor.with_fields(response=table, **axes_of(table, about, about))
-    boards, _ = boards_for(boards_of("vck190"), None, None)
-    question = Question(boards, [], (700, 600), [128], "exact", None, None, consistency=True)
     times = []
-    for profile in (sensor, departing):
-        rows = bench_board(Network.load(network), question, sensor=profile).rows
+    for profile in (sensor, departing(sensor)):
+        rows = bench_board(Network.load(network), question((700, 600)), sensor=profile).rows
         step, *_ = [r.figures["consistency step"] for r in rows if "consistency step" in r.figures]
         assert step.interval is not None
         times.append(step.interval[1])
