@@ -7,8 +7,8 @@ from pathlib import Path
 
 from docs.make.architecture import PACKAGES, imports_of, modules
 from docs.make.architecture import page as drawn
+from tests.project_files import ROOT, text_of
 
-ROOT = Path(__file__).resolve().parents[1]
 INSIDE: list[Path] = []
 for folder in PACKAGES:
     INSIDE += sorted((ROOT / folder).rglob("__init__.py"))
@@ -32,7 +32,7 @@ def test_packages_are_small_and_have_a_docstring() -> None:
 
 
 def test_files_that_the_page_names_exist() -> None:
-    page = (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8")
+    page = text_of("docs/explanation/architecture.md")
     mentions = {
         word
         for word in page.split("`")
@@ -44,7 +44,7 @@ def test_files_that_the_page_names_exist() -> None:
 
 def test_the_drawing_agrees_with_the_imports() -> None:
     """If this fails, run python docs/make/architecture.py."""
-    page = (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8")
+    page = text_of("docs/explanation/architecture.md")
     assert drawn(page) == page
 
 

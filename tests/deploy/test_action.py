@@ -17,12 +17,13 @@ from beers_deploy.model.shipped import SENSOR
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.onnx_file import save_onnx
 from tests.deploy.command_line import done
-from tests.deploy.workflow_steps import ACTION, BASH, KEPT, ROOT, Runner, read_yaml
+from tests.deploy.workflow_steps import ACTION, BASH, KEPT, Runner, read_yaml
 from tests.model.networks import plain
+from tests.project_files import ROOT, text_of
 from tests.quant.quick import changed
 from tests.shipped import shipped_pair
 
-WORKFLOW = ROOT / ".github" / "workflows" / "int8-gate.yml"
+WORKFLOW = ROOT / ".github/workflows/int8-gate.yml"
 OURS = "Train a small network"
 
 pytestmark = [
@@ -124,7 +125,7 @@ def test_without_an_int8_network_it_quantizes_for_the_same_sensor(
 ) -> None:
     copy_networks(runner, networks / "plain", "float.onnx")
     sensor = runner.folder / "mine.toml"
-    shutil.copy(ROOT / "profiles" / "sensors" / f"{SENSOR}.toml", sensor)
+    shutil.copy(ROOT / f"profiles/sensors/{SENSOR}.toml", sensor)
     outputs = runner.run_action(
         {"float": "models/float.onnx", "sensor": "mine.toml", "max-mae": "0.001"}
     )
@@ -192,7 +193,7 @@ def test_inputs_are_never_run_as_commands(runner: Runner) -> None:
 
 def test_every_input_and_output_of_the_action_is_described() -> None:
     action = read_yaml(ACTION)
-    page = (ROOT / "docs" / "how-to" / "gate.md").read_text(encoding="utf-8")
+    page = text_of("docs/how-to/gate.md")
     assert action["inputs"]["sensor"]["default"] == SENSOR
     for kind in ("inputs", "outputs"):
         for name, about in action[kind].items():

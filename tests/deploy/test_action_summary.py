@@ -17,9 +17,10 @@ from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 
 from beers_deploy.profiles.figures import Check
-from tests.deploy.workflow_steps import ACTION, ROOT, read_yaml
+from tests.deploy.workflow_steps import ACTION, read_yaml
+from tests.project_files import ROOT
 
-VERDICT = runpy.run_path(str(ROOT / ".github" / "verdict.py"))
+VERDICT = runpy.run_path(str(ROOT / ".github/verdict.py"))
 HOSTILE = (
     "a|b\n::error::c ` ``` <img src=x> **bold** [l](http://x) @someone \u202e\x1b[31m "
     "&amp; \\| ~~s~~ #1 %0A::x"
@@ -113,7 +114,7 @@ def test_a_document_of_another_run_is_no_verdict(code: int, document: object, fo
 
 
 def workflows() -> list[Path]:
-    return sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+    return sorted((ROOT / ".github/workflows").glob("*.yml"))
 
 
 def used(path: Path) -> list[str]:
@@ -143,7 +144,7 @@ def test_every_workflow_states_the_least_permissions() -> None:
 
 
 def test_the_workflow_to_copy_takes_limits_from_the_protected_branch() -> None:
-    (job,) = read_yaml(ROOT / ".github" / "workflows" / "int8-gate.yml")["jobs"].values()
+    (job,) = read_yaml(ROOT / ".github/workflows/int8-gate.yml")["jobs"].values()
     (protected,) = (step["with"] for step in job["steps"] if "ref" in step.get("with", {}))
     assert protected["ref"] == "${{ github.base_ref }}"
     (gate,) = (step["with"] for step in job["steps"] if step.get("id") == "gate")

@@ -35,6 +35,7 @@ from beers_deploy.report.plots import look, new_figure, svg_of
 from beers_deploy.results import Input, Table
 from beers_deploy.tables.markup import markdown_table, markdown_text
 from beers_deploy.tables.terminal import PIPE_WIDTH, print_rows
+from tests.project_files import ROOT
 
 HOSTILE = (
     "a|b\n::error::c\r\x1b[31m\x9b31m\x00 \u202egnp.exe\u2066 ``` <img src=x onerror=y> "
@@ -234,15 +235,12 @@ def test_a_drawing_has_the_text_as_words(text: str) -> None:
 
 def test_no_output_is_written_past_the_functions_that_escape() -> None:
     """Only these modules write to a terminal, and each was reviewed once."""
-    folder = Path(__file__).parents[2]
     printing = re.compile(
         r"typer\.echo\(|\bconsole\.print\(|std(out|err)\.write\(|(?<![.\w>])print\("
     )
     parts = ("deploy", "model", "quant", "profiles")
-    paths = chain.from_iterable((folder / part).rglob("*.py") for part in parts)
-    writers = {
-        path.relative_to(folder).as_posix() for path in paths if printing.search(_code(path))
-    }
+    paths = chain.from_iterable((ROOT / part).rglob("*.py") for part in parts)
+    writers = {path.relative_to(ROOT).as_posix() for path in paths if printing.search(_code(path))}
     allowed = {
         "deploy/__main__.py",
         "deploy/cli/commands.py",

@@ -13,10 +13,11 @@ import pytest
 from typer.testing import CliRunner
 
 from beers_deploy.cli.commands import app
+from tests.project_files import ROOT
 
 pytestmark = pytest.mark.slow
 
-NOTEBOOK = Path(__file__).parents[2] / "docs" / "tutorials" / "jp2-to-cog.ipynb"
+NOTEBOOK = ROOT / "docs/tutorials/jp2-to-cog.ipynb"
 CELLS: list[dict[str, Any]] = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
 MOST_BYTES = 100_000
 """Largest size of the notebook with its picture, because a clone has every version of it."""

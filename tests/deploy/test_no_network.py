@@ -23,10 +23,10 @@ from beers_deploy.model.convbeers import save_network
 from beers_deploy.model.variants import Variant
 from tests.deploy.sealed import SOCKET_CALL
 from tests.model.networks import plain
+from tests.project_files import ROOT
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).resolve().parents[2]
 needs_filters = pytest.mark.skipif(
     sys.platform != "linux" or platform.machine() not in SOCKET_CALL,
     reason="only Linux on x86-64 and AArch64 has these system calls",

@@ -13,6 +13,7 @@ from numpy.testing import assert_array_equal
 import beers_deploy as bd
 from beers_deploy.profiles.shipped import BLIND, profile_path
 from beers_deploy.verbs.restore import restore
+from tests.project_files import text_of
 from tests.shipped import shipped_pair
 
 NET = """
@@ -31,7 +32,6 @@ class Net(torch.nn.Module):
     def forward(self, image):
         return image + self.tail(torch.relu(self.head(image)))
 """
-PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "notebook.md"
 
 
 # The warning comes from the use of affine by rioxarray.
@@ -57,7 +57,7 @@ def test_the_page_gives_what_the_command_gives(
         Path(f"{stranger}.py").write_text("raise RuntimeError('a module of the user')\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     names: dict[str, Any] = {}
-    for code in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL):
+    for code in re.findall(r"```python\n(.*?)```", text_of("docs/how-to/notebook.md"), re.DOTALL):
         exec(code, names)  # noqa: S102 - our own page
     restore(Path("raw.tif"), Path("expected.tif"), network=shipped_pair(sensor=BLIND)[1])
     expected = tifffile.imread("expected.tif")

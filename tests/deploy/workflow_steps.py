@@ -16,7 +16,8 @@ from typing import Any
 
 import yaml  # type: ignore[import-untyped]  # its stubs are one more package, for one function
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.project_files import ROOT
+
 ACTION = ROOT / "action.yml"
 
 EXPRESSION = re.compile(r"\$\{\{ (.+?) \}\}")

@@ -15,10 +15,10 @@ from pathlib import Path
 
 from tests.deploy.test_outputs import outputs_of
 from tests.docs.test_commands_in_pages import NAME, context_of
-from tests.docs.walk import ROOT
+from tests.project_files import ROOT
 
-PAGES = sorted((ROOT / "docs" / "how-to").glob("*.md"))
-TUTORIALS = (ROOT / "docs" / "tutorials").glob("*.md")
+PAGES = sorted((ROOT / "docs/how-to").glob("*.md"))
+TUTORIALS = (ROOT / "docs/tutorials").glob("*.md")
 COMMANDS = "".join(page.read_text(encoding="utf-8") for page in TUTORIALS)
 STARTED = set(re.findall(rf"^{NAME} (\w+)", COMMANDS, re.MULTILINE))
 """Commands that the tests of the tutorials start in a process of their own."""

@@ -19,11 +19,11 @@ from tests.deploy.studies.characterize.test_characterize import RATIO, SENSOR, l
 from tests.deploy.studies.detection.folders import Object, dior
 from tests.deploy.studies.detection.networks import detector, raw
 from tests.docs.how_to import STARTED
-from tests.docs.walk import ROOT, Walk
+from tests.docs.walk import Walk
 from tests.model.networks import plain
 from tests.model.raster import formats as images
+from tests.project_files import ROOT, text_of
 
-HOW_TO = ROOT / "docs" / "how-to"
 SITES = 6
 SCENE_PX = 820
 """Number and side of the photographs, as `benchmarks/characterize.py` needs them."""
@@ -68,9 +68,7 @@ def copied_files(folder: Path) -> None:
 
 def shown(page: str, pattern: str) -> str:
     """Return the only part of a page that matches a pattern."""
-    (part,) = re.findall(
-        pattern, (HOW_TO / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
-    )
+    (part,) = re.findall(pattern, text_of(f"docs/how-to/{page}"), re.DOTALL | re.MULTILINE)
     return str(part)
 
 

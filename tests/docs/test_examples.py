@@ -8,7 +8,7 @@ import pytest
 
 import beers_deploy as bd
 from tests.deploy.studies.tradeoff.small import small_studies
-from tests.docs.walk import ROOT
+from tests.project_files import text_of
 
 pytestmark = pytest.mark.slow
 
@@ -28,7 +28,5 @@ def test_the_example_prints_what_it_shows(name: str) -> None:
 
 
 def test_the_cell_of_the_readme_runs() -> None:
-    (cell,) = re.findall(
-        r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL
-    )
+    (cell,) = re.findall(r"```python\n(.*?)```", text_of("README.md"), re.DOTALL)
     exec(cell, {})  # noqa: S102 - our own page

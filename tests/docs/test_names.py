@@ -17,9 +17,8 @@ from beers_deploy.profiles.scene_call import SceneCall
 from beers_deploy.profiles.shipped import board_names, scene_names
 from beers_deploy.profiles.target import TargetProfile
 from docs.make import api, commands, operators, target_file
+from tests.project_files import ROOT, text_of
 
-ROOT = Path(__file__).parents[2]
-DOCS = ROOT / "docs"
 PATH = re.compile(r"(?<![\w/.-])docs/[\w./-]*\w\.(?:md|py|toml|svg|png|ipynb)\b")
 LINK = re.compile(r"\]\((?!https?:|data:|#)([^)#\s]+)")
 TERMS = (
@@ -90,7 +89,7 @@ def test_the_page_explains_exactly_the_keys_of_the_boards() -> None:
 
 
 def test_the_page_of_scenes_is_correct_and_its_example_is_a_scene(tmp_path: Path) -> None:
-    page = (DOCS / "reference" / "scene-file.md").read_text(encoding="utf-8")
+    page = text_of("docs/reference/scene-file.md")
     (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     assert {*tomllib.loads(example)} <= {"description", "radiance_scale", "without", *TABLES}
     assert re.findall(r"Shipped: (.*)\.", page) == [
@@ -101,7 +100,7 @@ def test_the_page_of_scenes_is_correct_and_its_example_is_a_scene(tmp_path: Path
 
 
 def test_the_page_of_exit_codes_names_the_commands_with_a_verdict() -> None:
-    page = (DOCS / "reference" / "exit-codes.md").read_text(encoding="utf-8")
+    page = text_of("docs/reference/exit-codes.md")
     judging = {
         name
         for name, command in COMMANDS.items()
@@ -113,14 +112,14 @@ def test_the_page_of_exit_codes_names_the_commands_with_a_verdict() -> None:
 
 
 def test_the_glossary_has_the_terms_of_the_pages() -> None:
-    page = (DOCS / "reference" / "glossary.md").read_text(encoding="utf-8")
+    page = text_of("docs/reference/glossary.md")
     terms = " ".join(re.findall(r"^- \*\*(.*?)\*\*: ", page, re.MULTILINE))
     assert [term for term in TERMS if term not in terms] == []
 
 
 def test_every_number_of_the_readme_is_on_the_page_that_says_how_we_know() -> None:
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    page = (DOCS / "explanation" / "how-we-know.md").read_text(encoding="utf-8")
+    readme = text_of("README.md")
+    page = text_of("docs/explanation/how-we-know.md")
     prose = re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)", "", readme, flags=re.DOTALL)
     numbers = set(re.findall(r"(?<![\w.-])\d+(?:\.\d+)*", prose))
     assert len(numbers) > 10
@@ -128,26 +127,18 @@ def test_every_number_of_the_readme_is_on_the_page_that_says_how_we_know() -> No
 
 
 def test_the_citation_and_the_changelog_have_this_version() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    cited = dict(
-        re.findall(
-            r"^([\w-]+): (.+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE
-        )
-    )
+    project = tomllib.loads(text_of("pyproject.toml"))["project"]
+    cited = dict(re.findall(r"^([\w-]+): (.+)$", text_of("CITATION.cff"), re.MULTILINE))
     assert (cited["cff-version"], cited["version"]) == ("1.2.0", __version__)
-    changes = re.findall(
-        r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE
-    )
+    changes = re.findall(r"^## (.*)$", text_of("CHANGELOG.md"), re.MULTILINE)
     assert changes[0] == f"{__version__} - {cited['date-released']}"
     # The package also holds the viewer's licence.
     assert project["license"].split(" AND ")[0] == cited["license"]
 
 
 def test_the_workflow_of_the_site_installs_the_packages_of_the_extra() -> None:
-    extra = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
-        "optional-dependencies"
-    ]
-    workflow = (ROOT / ".github" / "workflows" / "docs.yml").read_text(encoding="utf-8")
+    extra = tomllib.loads(text_of("pyproject.toml"))["project"]["optional-dependencies"]
+    workflow = text_of(".github/workflows/docs.yml")
     installed = re.findall(r"pip install (.*?')(?: #.*)?$", workflow, re.MULTILINE)
     assert installed
     assert all(re.findall(r"'(.*?)'", line) == extra["docs"] for line in installed)

@@ -18,10 +18,10 @@ from urllib.parse import urlsplit
 import pytest
 
 from tests.deploy.browser import run_script
+from tests.project_files import ROOT
 
 Run = Callable[..., Any]
 
-ROOT = Path(__file__).parents[2]
 WIDTHS_PX = (1280, 390)
 SEARCHES = {
     "halo": "tiling",

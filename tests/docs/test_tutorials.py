@@ -11,18 +11,19 @@ import pytest
 import tifffile
 
 from tests.deploy.studies.tradeoff.small import small_studies
-from tests.docs.walk import ROOT, Walk
+from tests.docs.walk import Walk
+from tests.project_files import ROOT, text_of
 
 pytestmark = pytest.mark.slow
 
-FOLDER = ROOT / "docs" / "tutorials"
+FOLDER = ROOT / "docs/tutorials"
 PAGES = sorted({path.stem for path in FOLDER.glob("*.md")} - {"index"})
 INSTALLED = "python3 -m venv .venv && .venv/bin/pip install --quiet '.[all]'"
 
 
 def run_page(name: str, folder: Path) -> Walk:
     walk = Walk(folder)
-    walk.page((FOLDER / f"{name}.md").read_text(encoding="utf-8"))
+    walk.page(text_of(f"docs/tutorials/{name}.md"))
     return walk
 
 
@@ -31,10 +32,10 @@ def test_it_is_set_up_as_the_readme_says(name: str) -> None:
     """.ci/run runs this command in an empty environment. Only this fence of a tutorial is not run
     here.
     """
-    page = (FOLDER / f"{name}.md").read_text(encoding="utf-8")
+    page = text_of(f"docs/tutorials/{name}.md")
     (block,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
     assert block.splitlines()[0] == INSTALLED
-    assert INSTALLED in (ROOT / "README.md").read_text(encoding="utf-8")
+    assert INSTALLED in text_of("README.md")
     assert set(re.findall(r"^```(\w+)", page, re.MULTILINE)) <= {
         "sh",
         "bash",

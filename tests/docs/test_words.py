@@ -3,9 +3,9 @@
 import ast
 from collections.abc import Iterator
 from itertools import chain
-from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
+from tests.project_files import ROOT
+
 SOURCE = ("profiles", "model", "quant", "deploy")
 PARTICIPLES = {"found", "held", "kept", "looked", "lost", "made", "said", "seen", "told", "wanted"}
 """Such a name leaves out what was found or kept, so that a reader must look for the noun."""

@@ -32,8 +32,8 @@ from pathlib import Path
 from typer.testing import CliRunner
 
 from beers_deploy.cli.commands import app
+from tests.project_files import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 PYTHON = [sys.executable]
 OURS = "beers-deploy"
 PROGRAMS = {

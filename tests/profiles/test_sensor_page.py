@@ -18,10 +18,9 @@ from beers_deploy.profiles.sensor_numbers import same_instrument
 from beers_deploy.profiles.shipped import sensor_names
 from beers_deploy.profiles.validation import validated
 from tests.deploy.command_line import done
+from tests.project_files import text_of
 
-PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "sensor-profile.md").read_text(
-    encoding="utf-8"
-)
+PAGE = text_of("docs/reference/sensor-profile.md")
 ROWS = dict(re.findall(r"^- `(\[\w+\] \w+)` \(.+?; (.+?)\): .+$", PAGE, re.MULTILINE))
 """The range of each key, as the page states it."""
 

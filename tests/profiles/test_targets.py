@@ -12,8 +12,9 @@ from beers_deploy.profiles.errors import BeersError, ProfileError
 from beers_deploy.profiles.shipped import HERE, board_names, target_names
 from beers_deploy.profiles.target import TargetProfile
 from tests.deploy.command_line import done, refused
+from tests.project_files import text_of
 
-PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "boards.md").read_text(encoding="utf-8")
+PAGE = text_of("docs/reference/boards.md")
 (EXAMPLE,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
 
 

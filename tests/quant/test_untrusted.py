@@ -21,6 +21,7 @@ from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from beers_deploy.quant.untrusted import FILE_BYTES
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
+from tests.project_files import ROOT
 from tests.quant.simplify.networks import parsed
 
 Change = Callable[[onnx.ModelProto], object]
@@ -283,17 +284,16 @@ def test_a_long_chain_of_activations_is_followed_quickly(tmp_path: Path) -> None
 
 def test_onnx_files_are_opened_in_few_places() -> None:
     """Only the modules that are listed here open an ONNX file or pass one to a runtime."""
-    root = Path(__file__).parents[2]
     openers = {
         "onnx.load": set[str](),
         "ParseFromString(": set[str](),
         "InferenceSession(": set[str](),
     }
     for folder in ("deploy", "model", "profiles", "quant"):
-        for path in (root / folder).rglob("*.py"):
+        for path in (ROOT / folder).rglob("*.py"):
             for word, places in openers.items():
                 if word in path.read_text(encoding="utf-8"):
-                    places.add(str(path.relative_to(root)))
+                    places.add(str(path.relative_to(ROOT)))
     assert openers == {
         "onnx.load": set(),
         # A digest only reads the names of files with external weights.

@@ -1,13 +1,11 @@
 """Tests that the code and the tests named in mutations.toml exist."""
 
 import re
-from pathlib import Path
 
 import pytest
 
+from tests.project_files import text_of
 from tests.stability import mutations as maker
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_all_ten_mutations_name_a_test() -> None:
@@ -26,7 +24,7 @@ def test_a_mutation_survives_unless_every_test_that_it_names_fails() -> None:
 def test_a_mutation_changes_one_or_two_lines_and_its_tests_exist(
     mutation: maker.Mutation,
 ) -> None:
-    original = (ROOT / mutation.file).read_text(encoding="utf-8")
+    original = text_of(mutation.file)
     mutated = maker.broken(original, mutation)
     compile(mutated, mutation.file, "exec")
     assert (
@@ -35,6 +33,4 @@ def test_a_mutation_changes_one_or_two_lines_and_its_tests_exist(
         <= 2
     )
     for file, name in (test.split("::") for test in mutation.tests):
-        assert re.search(
-            rf"^def {name}\(", (ROOT / maker.SUITE / file).read_text(encoding="utf-8"), re.MULTILINE
-        )
+        assert re.search(rf"^def {name}\(", text_of(f"{maker.SUITE}/{file}"), re.MULTILINE)

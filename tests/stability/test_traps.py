@@ -24,8 +24,8 @@ from beers_deploy.model.traditional.pipeline import Order, TraditionalPipeline, 
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Sensor
 from tests.model.traditional.whole import compensate
+from tests.project_files import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 TRAPS = 18
 NAMED = re.compile(r"`(tests/[\w/]+\.py)::(\w+)`")
 

@@ -4,9 +4,9 @@ import json
 import re
 import tomllib
 from itertools import chain
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.project_files import ROOT, text_of
+
 PINNED = re.compile(r"[\w./-]+:\d+\.\d+\.\d+[\w.-]*@sha256:[0-9a-f]{64}")
 FETCHES = re.compile(r"\b(curl|wget|git clone)\b|https?://")
 PINNED_INSTALL = re.compile(r"--require-hashes|--no-index|install( --[\w-]+)* [\w-]+==[\d.]+$")
@@ -14,7 +14,7 @@ PINNED_INSTALL = re.compile(r"--require-hashes|--no-index|install( --[\w-]+)* [\
 
 def arguments_of(*words: str) -> list[str]:
     """Return the arguments of these instructions, with continued lines joined."""
-    text = re.sub(r"(?m)^\s*#.*\n", "", (ROOT / "Dockerfile").read_text()).replace("\\\n", " ")
+    text = re.sub(r"(?m)^\s*#.*\n", "", text_of("Dockerfile")).replace("\\\n", " ")
     parts = [line.strip().partition(" ") for line in text.splitlines()]
     return [rest for word, _, rest in parts if word.upper() in words]
 
@@ -41,7 +41,7 @@ def test_bases_are_pinned_packages_hashed_and_root_is_not_used() -> None:
 
 
 def test_every_folder_of_the_package_reaches_the_image() -> None:
-    lines = (ROOT / ".dockerignore").read_text().splitlines()
+    lines = text_of(".dockerignore").splitlines()
     allowed = {line[1:] for line in lines if line.startswith("!")}
     assert {"setup.py", "profiles", "model", "quant", "deploy"} <= copied() <= allowed
     assert all((ROOT / name).exists() for name in copied())
@@ -49,5 +49,5 @@ def test_every_folder_of_the_package_reaches_the_image() -> None:
 
 def test_it_starts_the_command() -> None:
     (start,) = arguments_of("ENTRYPOINT")
-    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    scripts = tomllib.loads(text_of("pyproject.toml"))["project"]["scripts"]
     assert json.loads(start) == list(scripts)

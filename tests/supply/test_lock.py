@@ -2,12 +2,12 @@
 
 import re
 import tomllib
-from pathlib import Path
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.project_files import text_of
+
 PIN = re.compile(
     r"(?P<name>[\w.-]+)==(?P<version>[\w.!]+)(?P<hashes>( --hash=sha256:[0-9a-f]{64})+)"
 )
@@ -16,7 +16,7 @@ PINNED = re.compile(r"(?m)^[\w.-]+==[\w.!]+")
 
 
 def requirements_of(*extras: str) -> list[str]:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    project = tomllib.loads(text_of("pyproject.toml"))
     requirements = []
     for extra in extras:
         requirements += project["project"]["optional-dependencies"][extra]
@@ -50,9 +50,7 @@ def faults(lock: str, requirements: list[str]) -> list[str]:
 
 
 def test_the_locks_satisfy_the_project() -> None:
-    full, core = (
-        (ROOT / name).read_text() for name in ("requirements.lock", "requirements-core.lock")
-    )
+    full, core = (text_of(name) for name in ("requirements.lock", "requirements-core.lock"))
     assert faults(full, requirements_of("study", "torch")) == []
     assert faults(core, requirements_of()) == []
     assert set(PINNED.findall(core)) < set(PINNED.findall(full))

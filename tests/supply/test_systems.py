@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.project_files import ROOT, text_of
+
 PACKAGES = ("deploy", "model", "quant", "profiles")
 OF_ONE_SYSTEM = {
     "fcntl",
@@ -38,11 +39,11 @@ def test_every_page_installs_the_same_torch() -> None:
 
 def test_the_workflow_and_its_page_name_the_same_systems() -> None:
     yaml = pytest.importorskip("yaml", reason="no package yaml to read the workflow with")
-    jobs = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text(encoding="utf-8"))["jobs"]
+    jobs = yaml.safe_load(text_of(".github/workflows/ci.yml"))["jobs"]
     pythons = [job["strategy"]["matrix"]["python"] for job in jobs.values()]
     assert pythons == [["3.11", "3.12", "3.13", "3.14"]] * 2
     assert jobs["elsewhere"]["strategy"]["matrix"]["system"] == ["macos-latest", "windows-latest"]
-    page = (ROOT / "docs" / "reference" / "systems.md").read_text(encoding="utf-8")
+    page = text_of("docs/reference/systems.md")
     rows = [line.split("|") for line in page.splitlines() if "job `elsewhere`)" in line]
     assert [row[1].split(",")[0].strip() for row in rows] == ["macOS", "Windows"]
     assert {row[2].strip() for row in rows} == {f"{pythons[1][0]} to {pythons[1][-1]}"}

@@ -16,8 +16,8 @@ import tifffile
 from packaging.requirements import Requirement
 
 from tests.deploy.dpu.graphs import Sketch
+from tests.project_files import ROOT, text_of
 
-ROOT = Path(__file__).resolve().parents[2]
 PROJECT = [
     "deploy",
     "model",
@@ -38,9 +38,7 @@ def lowest_versions() -> list[str]:
     """Return `name==version` of each core dependency, by the lower bound that pyproject.toml
     declares.
     """
-    declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
-        "dependencies"
-    ]
+    declared = tomllib.loads(text_of("pyproject.toml"))["project"]["dependencies"]
     pins = []
     for requirement in map(Requirement, declared):
         (lowest,) = (clause.version for clause in requirement.specifier if clause.operator == ">=")

@@ -14,9 +14,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.verbs.restore import restore
 from tests.model.raster import formats as images
+from tests.project_files import ROOT
 from tests.shipped import shipped_pair
 
-ROOT = Path(__file__).parents[3]
 PYTHON = Path("/usr/bin/python3")
 """The system's Python, because the packages of QGIS are in no virtual environment."""
 PIXELS = np.tile(images.digital_numbers(), (1, 5, 6))
@@ -124,7 +124,7 @@ def test_qgis_s_toolbox_restores(qgis: Path, tmp_path: Path) -> None:
     program = tmp_path / "beers-deploy"
     program.write_text(f'#!/bin/sh\nPYTHONPATH={ROOT} exec {sys.executable} -m beers_deploy "$@"\n')
     program.chmod(0o755)
-    script = ROOT / "examples" / "qgis_restore.py"
+    script = ROOT / "examples/qgis_restore.py"
     outs = [tmp_path / "restored.tif", tmp_path / "restored.xyz"]
     (first_done, _), (second_done, log) = answer(
         qgis, "-c", IN_QGIS.replace("{}", RUN), script, program, image, *outs

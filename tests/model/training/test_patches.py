@@ -25,6 +25,7 @@ from beers_deploy.profiles.response import MtfTable
 from beers_deploy.profiles.sensor import Sensor
 from tests.model.simulator.stages import NOMINAL, point_spread, with_response
 from tests.model.training.sources import small_scene, source
+from tests.project_files import ROOT
 
 
 def test_the_same_seed_gives_the_same_batches_from_anywhere() -> None:
@@ -56,12 +57,11 @@ def test_drawing_patches_keeps_the_number_of_threads() -> None:
 
 def threads_after(work: str) -> str:
     code = f"import torch\n{work}\nprint(torch.get_num_threads())"
-    root = Path(__file__).parents[3]
     # The suite's own processes have one thread, so a change of their number would not show there.
     two = {**os.environ, "OMP_NUM_THREADS": "2"}
     command = [sys.executable, "-c", code]
     return subprocess.run(
-        command, cwd=root, env=two, capture_output=True, text=True, check=True
+        command, cwd=ROOT, env=two, capture_output=True, text=True, check=True
     ).stdout
 
 

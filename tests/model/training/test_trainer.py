@@ -28,6 +28,7 @@ from beers_deploy.model.training.trainer import Precision, Schedule, Trainer, Wo
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError, OptionError
 from tests.model.training.sources import small_scene, source
+from tests.project_files import ROOT
 
 VARIANT = Variant(blocks=1, features=4)
 RECIPE = TrainingRecipe(steps=8, batch=3, warm_up_steps=2)
@@ -286,7 +287,7 @@ def test_two_workers_do_the_steps_of_one_with_a_batch_twice_as_large(tmp_path: P
     environment = {
         **os.environ,
         "OMP_NUM_THREADS": "1",
-        "PYTHONPATH": str(Path(__file__).parents[3]),
+        "PYTHONPATH": str(ROOT),
     }
     options: dict[str, Any] = {
         "env": environment,
