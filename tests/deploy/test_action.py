@@ -21,6 +21,7 @@ from tests.deploy.workflow_steps import ACTION, BASH, KEPT, Runner, read_yaml
 from tests.model.networks import plain
 from tests.project_files import ROOT, text_of
 from tests.quant.quick import changed
+from tests.quant.simplify.networks import parsed
 from tests.shipped import shipped_pair
 
 WORKFLOW = ROOT / ".github/workflows/int8-gate.yml"
@@ -145,17 +146,10 @@ def test_a_network_that_quantize_refuses_is_an_error_whose_reason_is_in_the_summ
     runner: Runner,
 ) -> None:
     """This holds also if the document of a version that passed is where the verdict goes."""
-    node = onnx.helper.make_node("Sin", ["x"], ["y"], name="odd\n::error::obeyed | `name` <b>")
-    ends = [
-        onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, 1, "h", "w"])
-        for name in "xy"
-    ]
-    graph = onnx.helper.make_graph([node], "g", ends[:1], ends[1:])
+    model = parsed("y = Sin(x)", "float[1,1,h,w] x => float[1,1,h,w] y")
+    model.graph.node[0].name = "odd\n::error::obeyed | `name` <b>"
     (runner.folder / "models").mkdir()
-    save_onnx(
-        onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)]),
-        runner.folder / "models" / "float.onnx",
-    )
+    save_onnx(model, runner.folder / "models" / "float.onnx")
     (runner.folder / "gate.json").write_text('{"verdict": "passed"}')
     outputs = runner.run_action({"float": "models/float.onnx"})
     assert runner.red

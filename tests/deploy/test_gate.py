@@ -18,14 +18,14 @@ from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.limits import Limits, judge
-from beers_deploy.quant.onnx.image_input import image_info
-from beers_deploy.quant.onnx_file import GraphWriter, load_onnx, make_model, save_onnx
+from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.structure import Relus, count_relus, rounded_tensors, saturated_shares
 from beers_deploy.verdict import file_checks
 from tests.deploy.command_line import done, refused
 from tests.quant.quick import change, changed, drawn, quantized_freely
+from tests.quant.simplify.networks import parsed
 from tests.shipped import shipped_pair
 
 Corrupt = Callable[[onnx.ModelProto], object]
@@ -157,11 +157,9 @@ def test_options_that_do_not_go_together_are_refused(tmp_path: Path) -> None:
 
 def test_results_that_are_no_images_are_not_clipped_and_other_shapes_are_refused() -> None:
     def shifted(by: float, channels: int = 1) -> ort.InferenceSession:
-        w = GraphWriter()
-        weight = w.constant("w", np.ones((channels, 1, 1, 1), np.float32))
-        w.node("Conv", "y", ["x", weight, w.constant("b", np.full(channels, by, np.float32))])
-        ends = [image_info("x", 1, None)], [image_info("y", channels, None)]
-        return open_session(make_model(w.graph("g", *ends), {}))
+        constants = {"w": np.ones((channels, 1, 1, 1)), "b": np.full(channels, by, np.float32)}
+        ends = f"float[N,1,H,W] x => float[N,{channels},H,W] y"
+        return open_session(parsed("y = Conv(x, w, b)", ends, constants=constants))
 
     image = np.random.default_rng(0).random((1, 1, 8, 9), np.float32)
     patches = Patches([(image, np.empty(0, np.float32))], [image])

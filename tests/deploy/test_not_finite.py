@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import tifffile
 import torch
-from onnx import helper, numpy_helper
 
 from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, save_network
@@ -18,6 +17,7 @@ from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.session import open_session
 from tests.deploy.command_line import done
 from tests.quant.quick import patches_of
+from tests.quant.simplify.networks import parsed
 
 VARIANT = "convbeers-xs"
 INT8 = f"{VARIANT}-int8"
@@ -129,17 +129,12 @@ def test_the_gate_fails_a_network_whose_sums_overflow(tmp_path: Path, scenes: Pa
 
 def test_the_gate_does_not_clip_an_infinite_pixel_to_full_scale() -> None:
     """If both sides were clipped to 1, infinity in both networks would agree."""
-    ends = [
-        helper.make_tensor_value_info(name, 1, ["N", 1, "H", "W"]) for name in ("image", "restored")
-    ]
-    scale = numpy_helper.from_array(np.full((1, 1, 1, 1), 3e38, np.float32), "s")
-    nodes = [
-        helper.make_node("Mul", ["image", "s"], ["a"]),
-        helper.make_node("Mul", ["a", "s"], ["restored"]),
-    ]
-    graph = helper.make_graph(nodes, "g", ends[:1], ends[1:], [scale])
     session = open_session(
-        helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+        parsed(
+            "a = Mul(image, s) restored = Mul(a, s)",
+            "float[N,1,H,W] image => float[N,1,H,W] restored",
+            constants={"s": 3e38},
+        )
     )
     image = np.full((1, 1, 8, 8), 0.5, np.float32)
     assert np.isnan(compare(session, session, patches_of([image])).mae)

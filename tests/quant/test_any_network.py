@@ -23,14 +23,13 @@ from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
 from beers_deploy.quant.integer.agreement import agreement
 from beers_deploy.quant.integer.reference import run_core
-from beers_deploy.quant.onnx.image_input import image_info
-from beers_deploy.quant.onnx_file import GraphWriter, make_model
 from beers_deploy.quant.passes.selection import Passes
 from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.simplify.simplify import simplify
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from examples.networks import NETWORKS, build, to_onnx
 from tests.quant.quick import copied, patches_of, quickly, run_model
+from tests.quant.simplify.networks import parsed
 from tests.quant.tiling.small_networks import check_tiles
 from tests.quant.trained import assert_equals_reference, moved
 
@@ -170,16 +169,10 @@ def test_tiles_of_int8_give_the_whole(name: str) -> None:
 
 def one_convolution(weight: float, bias: float) -> onnx.ModelProto:
     """Build image * weight + bias, without a global add."""
-    writer = GraphWriter()
-    weights = writer.constant("w", np.full((1, 1, 1, 1), weight, np.float32))
-    writer.node(
-        "Conv",
-        "restored",
-        ["image", weights, writer.constant("b", np.full(1, bias, np.float32))],
-        "c",
-    )
-    return make_model(
-        writer.graph("one", [image_info("image", 1, None)], [image_info("restored", 1, None)]), {}
+    return parsed(
+        "restored = Conv(image, w, b)",
+        "float[N,1,H,W] image => float[N,1,H,W] restored",
+        constants={"w": [[[[weight]]]], "b": [bias]},
     )
 
 

@@ -20,9 +20,9 @@ from beers_deploy.quant.graph import (
     read_network,
 )
 from beers_deploy.quant.host_part import IMAGE_SLICES
-from beers_deploy.quant.onnx.image_input import image_info
-from beers_deploy.quant.onnx_file import GraphWriter, make_model
+from beers_deploy.quant.onnx_file import GraphWriter
 from tests.quant.quick import behind_conv, copied, run_model
+from tests.quant.simplify.networks import parsed
 
 
 def test_no_digital_number_is_lost_in_planes_nor_wrapped() -> None:
@@ -53,15 +53,12 @@ def test_a_plain_network_keeps_its_weights_and_relus_and_leaves_the_global_add(
 
 @pytest.mark.parametrize("kind", ["Sigmoid", "Tanh"])
 def test_other_operators_are_refused_by_name(kind: str) -> None:
-    nodes = [
-        helper.make_node(kind, ["image"], ["x"]),
-        helper.make_node("Add", ["image", "x"], ["restored"]),
-    ]
-    graph = helper.make_graph(
-        nodes, "g", [image_info("image", 1, None)], [image_info("restored", 1, None)]
+    model = parsed(
+        f"x = {kind}(image) restored = Add(image, x)",
+        "float[N,1,H,W] image => float[N,1,H,W] restored",
     )
     with pytest.raises(ModelError, match=kind):
-        correction_graph(make_model(graph, {}))
+        correction_graph(model)
 
 
 def test_a_network_without_a_global_add_is_refused(float_onnx: onnx.ModelProto) -> None:

@@ -32,6 +32,7 @@ from beers_deploy.quant.kernels import (
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session, run
 from tests.quant.quick import quantized_freely
+from tests.quant.simplify.networks import parsed
 from tests.shipped import shipped_pair
 
 SHAPES = [(1, 1, 1), (3, 5, 3), (4, 6, 1), (16, 16, 3), (5, 33, 3), (32, 8, 2), (17, 32, 3)]
@@ -65,28 +66,13 @@ def convolution(
         "result_unit": np.float32(1 / unit / 4),
         "bias": np.arange(outputs, dtype=np.int32) * 1001 - 7,
     }
-    feeds = [
-        "image",
-        "unit",
-        "middle",
-        "weight",
-        "weight_unit",
-        "weight_middle",
-        "result_unit",
-        "middle",
-        "bias",
-    ]
-    element = helper.np_dtype_to_tensor_dtype(np.dtype(kind))
-    ends = [
-        helper.make_tensor_value_info(name, element, ["N", None, "H", "W"])
-        for name in ("image", "result")
-    ]
-    initializers = [
-        numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()
-    ]
-    node = helper.make_node("QLinearConv", feeds, ["result"], name="convolution", group=groups)
-    graph = helper.make_graph([node], "one", ends[:1], ends[1:], initializers)
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    element = kind.__name__
+    return parsed(
+        f"""[convolution] result = QLinearConv<group={groups}>(image, unit, middle,
+            weight, weight_unit, weight_middle, result_unit, middle, bias)""",
+        f"{element}[N,C,H,W] image => {element}[N,C2,H2,W2] result",
+        constants=constants,
+    )
 
 
 def by_definition(model: onnx.ModelProto, image: np.ndarray) -> np.ndarray:
@@ -225,14 +211,11 @@ def test_matrix_products_sum_exactly_too() -> None:
     generator = np.random.default_rng(1)
     weight = generator.choice([-128, 127], (33, 17)).astype(np.int8)
     image = generator.choice([0, 255], (5, 33)).astype(np.uint8)
-    image_in, sums_out = (
-        helper.make_tensor_value_info(name, kind, None)
-        for name, kind in (("image", TensorProto.UINT8), ("sums", TensorProto.INT32))
+    model = parsed(
+        "sums = MatMulInteger(image, weight)",
+        "uint8[N,C] image => int32[N,C2] sums",
+        constants={"weight": weight},
     )
-    node = helper.make_node("MatMulInteger", ["image", "weight"], ["sums"])
-    initializers = [numpy_helper.from_array(weight, "weight")]
-    graph = helper.make_graph([node], "one", [image_in], [sums_out], initializers)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     sums = open_session(model, 1, exact=True).run(None, {"image": image})[0]
     assert np.array_equal(sums, image.astype(np.int64) @ weight.astype(np.int64))
 

@@ -12,8 +12,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from onnx import TensorProto, helper
 
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
-from beers_deploy.quant.onnx.image_input import image_info
-from beers_deploy.quant.onnx_file import GraphWriter, make_model
 from beers_deploy.quant.samples.own import OwnSamples, read_samples, samples_of
 from beers_deploy.quant.samples.patches import Regenerated
 from beers_deploy.quant.tiling.receptive_field import tiling_of
@@ -182,12 +180,8 @@ def test_invalid_samples_are_refused(
 
 def network(channels: int) -> onnx.ModelProto:
     """Return a network of one ReLU over some channels."""
-    writer = GraphWriter()
-    writer.node("Relu", "restored", ["image"])
-    image_in = image_info("image", channels, None)
-    image_out = image_info("restored", channels, None)
-    graph = writer.graph("none", [image_in], [image_out])
-    return make_model(graph, {})
+    shape = f"float[N,{channels},H,W]"
+    return parsed("restored = Relu(image)", f"{shape} image => {shape} restored")
 
 
 def test_networks_that_simulated_patches_do_not_suit_ask_for_samples() -> None:

@@ -10,8 +10,7 @@ import onnx
 import pytest
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.onnx.image_input import image_info
-from beers_deploy.quant.onnx_file import GraphWriter, make_model, save_onnx
+from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.tiles.rows import restore_floats
@@ -24,6 +23,7 @@ from docs.make import stability as maker
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 from tests.quant.quick import changed
+from tests.quant.simplify.networks import parsed
 
 BY_NAME = {case.name: case for case in CASES}
 SIDE_PX = 32
@@ -125,12 +125,12 @@ def test_a_broken_int8_network_fails(pair: list[Path], tmp_path: Path) -> None:
 def test_networks_of_several_bands_or_another_size_are_refused(
     bands: int, block: int, tmp_path: Path
 ) -> None:
-    writer = GraphWriter()
-    weight = writer.constant("w", np.ones((bands * block**2, bands, 1, 1), np.float32))
-    writer.node("Conv", "x", ["image", weight], "conv")
-    writer.node("DepthToSpace", "restored", ["x"], "shuffle", blocksize=block)
-    ends = ([image_info(name, bands, None)] for name in ("image", "restored"))
-    save_onnx(make_model(writer.graph("g", *ends), {}), tmp_path / "a.onnx")
+    model = parsed(
+        f"x = Conv(image, w) restored = DepthToSpace<blocksize={block}>(x)",
+        f"float[N,{bands},H,W] image => float[N,{bands},H,W] restored",
+        constants={"w": np.ones((bands * block**2, bands, 1, 1))},
+    )
+    save_onnx(model, tmp_path / "a.onnx")
     assert "make one band of one band, in the same size" in refused("stress", tmp_path / "a.onnx")
 
 
