@@ -6,9 +6,9 @@ from beers_deploy.profiles.constant import Stated
 from beers_deploy.profiles.response import MtfTable
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import axes_of
-from beers_deploy.profiles.shipped import HERE
+from tests.project_files import text_of
 
-SHIPPED = (HERE / "sensors" / "pleiades-degraded.toml").read_text(encoding="utf-8")
+SHIPPED = text_of("profiles/sensors/pleiades-degraded.toml")
 
 
 def edited(*changes: tuple[str, str]) -> str:

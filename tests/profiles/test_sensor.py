@@ -12,10 +12,11 @@ from beers_deploy.profiles.errors import ProfileError
 from beers_deploy.profiles.instrument import noise_from_snr, snr_0_bounds
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import TABLES
-from beers_deploy.profiles.shipped import HERE, sensor_names, target_names
+from beers_deploy.profiles.shipped import sensor_names, target_names
 from beers_deploy.profiles.target import TargetProfile
 from tests.profiles.own_sensor import own_sensor
 from tests.profiles.test_profile_files import refusal
+from tests.project_files import text_of
 
 SHIPPED = [
     "dior-high",
@@ -150,8 +151,9 @@ def test_bounds_are_where_a_coefficient_changes_sign(snr_1: float, share: float)
 
 
 def with_table(folder: Path, table: str) -> Path:
-    text = (HERE / "sensors" / "pleiades-reference.toml").read_text(encoding="utf-8")
-    return own_sensor(folder, text=f"{text}\n{table}")
+    return own_sensor(
+        folder, text=f"{text_of('profiles/sensors/pleiades-reference.toml')}\n{table}"
+    )
 
 
 def test_a_table_adds_its_effect(tmp_path: Path) -> None:

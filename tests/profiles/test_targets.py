@@ -9,13 +9,13 @@ from typer.testing import CliRunner
 from beers_deploy.cli.commands import app
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.profiles.errors import BeersError, ProfileError
-from beers_deploy.profiles.shipped import HERE, board_names, target_names
+from beers_deploy.profiles.shipped import board_names, target_names
 from beers_deploy.profiles.target import TargetProfile
 from tests.deploy.command_line import done, refused
 from tests.project_files import text_of
 
-PAGE = text_of("docs/reference/boards.md")
-(EXAMPLE,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
+(EXAMPLE,) = re.findall(r"```toml\n(.*?)```", text_of("docs/reference/boards.md"), re.DOTALL)
+VEK280 = text_of("profiles/targets/vek280.toml")
 
 
 def write_board(folder: Path, text: str) -> str:
@@ -73,11 +73,7 @@ def test_a_wrong_board_gets_one_sentence(
 
 
 def test_a_misspelt_constant_does_not_silence_its_rule(tmp_path: Path) -> None:
-    text = (
-        (HERE / "targets" / "vek280.toml")
-        .read_text(encoding="utf-8")
-        .replace("\narea_max =", "\narea_mox =")
-    )
+    text = VEK280.replace("\narea_max =", "\narea_mox =")
     output = done("check", "--tile", "64", "--target", write_board(tmp_path, text), code=2)
     assert "[conv]" in output
     assert "'area_mox'" in output
@@ -85,14 +81,13 @@ def test_a_misspelt_constant_does_not_silence_its_rule(tmp_path: Path) -> None:
 
 
 def test_a_board_without_a_base_names_its_documents(tmp_path: Path) -> None:
-    text = (HERE / "targets" / "vek280.toml").read_text(encoding="utf-8")
-    without = re.sub(r"\[documents].*?\n\n", "", text, flags=re.DOTALL)
+    without = re.sub(r"\[documents].*?\n\n", "", VEK280, flags=re.DOTALL)
     with pytest.raises(ProfileError, match=r"my-board has no table \[documents\]"):
         load_dpu(write_board(tmp_path, without))
 
 
 def test_without_cost_constants_only_predictions_are_refused(tmp_path: Path) -> None:
-    text = (HERE / "targets" / "vck190.toml").read_text(encoding="utf-8")
+    text = text_of("profiles/targets/vck190.toml")
     path = write_board(tmp_path, re.sub(r"\n\[cost].*?\n\n", "\n", text, flags=re.DOTALL))
     done("check", "--tile", "64", "--target", path)
     assert "no cost constants yet" in refused(
