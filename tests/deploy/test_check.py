@@ -12,6 +12,7 @@ from beers_deploy.quant.graph.split_network import REMEDY
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
+from tests.quant.quick import fix_sizes
 
 
 def tables(path: Path) -> dict[str, list[dict[str, Any]]]:
@@ -34,8 +35,7 @@ def test_convbeers_passes_whole_in_every_encoding(tmp_path: Path) -> None:
 def test_a_network_of_one_tile_is_checked_at_that(tmp_path: Path) -> None:
     model = onnx.load(float_convbeers(tmp_path / "n.onnx", 2, 8))
     for value in (*model.graph.input, *model.graph.output):
-        for side in value.type.tensor_type.shape.dim[2:]:
-            side.dim_value = 96
+        fix_sizes(value, 96, 96)
     onnx.save(model, tmp_path / "fixed.onnx")
     assert "tile 96" in done(f"check {tmp_path}/fixed.onnx")
     assert "--tile 96" in refused(f"check {tmp_path}/fixed.onnx --tile 640")

@@ -17,7 +17,7 @@ from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.quant.input_range import from_shares, to_shares
 from beers_deploy.quant.onnx.image_input import image_info
 from beers_deploy.quant.onnx_file import GraphWriter, make_model
-from tests.quant.quick import one_guess
+from tests.quant.quick import fix_sizes, one_guess
 
 CHANNELS = 4
 GENERATOR = 5
@@ -213,8 +213,7 @@ def test_commands_do_not_contradict_each_other(
 def fixed(path: Path, side_px: int) -> Path:
     """Write the network of a file again, fixed to images of a size."""
     model = onnx.load(path)
-    for dim in model.graph.input[0].type.tensor_type.shape.dim[2:]:
-        dim.dim_value = side_px
+    fix_sizes(model.graph.input[0], side_px, side_px)
     onnx.save(onnx.shape_inference.infer_shapes(model), path.with_name("fixed.onnx"))
     return path.with_name("fixed.onnx")
 

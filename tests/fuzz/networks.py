@@ -26,6 +26,7 @@ from beers_deploy.quant.structure import count_relus, rounded_tensors, saturated
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from tests.deploy.dpu.graphs import board_convbeers, float_convbeers, integer_convbeers
 from tests.fuzz.pictures import written
+from tests.quant.quick import fix_sizes
 from tests.quant.simplify.networks import CASES, network_from
 
 SIDE_PX = 16
@@ -42,10 +43,7 @@ def onnx_seeds(folder: Path) -> list[bytes]:
     ]
     fixed = onnx.load_model(float_convbeers(folder / "a.onnx", 1, 2))
     for value in (*fixed.graph.input, *fixed.graph.output):
-        for dim, size in zip(
-            value.type.tensor_type.shape.dim, (1, 1, SIDE_PX, SIDE_PX), strict=True
-        ):
-            dim.dim_value = size
+        fix_sizes(value, 1, 1, SIDE_PX, SIDE_PX)
     return [*paths, fixed.SerializeToString()]
 
 

@@ -114,6 +114,13 @@ def behind_conv(write: Callable[[GraphWriter], object]) -> onnx.ModelProto:
     return make_model(writer.graph("g", [image_info("image", 1, None)], [result]), {})
 
 
+def fix_sizes(value: onnx.ValueInfoProto, *sizes: int) -> None:
+    """Fix the last sizes of an input or output: height and width, or those before them as well."""
+    dims = value.type.tensor_type.shape.dim
+    for dim, size in zip(dims[-len(sizes) :], sizes, strict=True):
+        dim.dim_value = size
+
+
 def copied(model: onnx.ModelProto) -> onnx.ModelProto:
     copy = onnx.ModelProto()
     copy.CopyFrom(model)

@@ -9,12 +9,12 @@ import onnx
 import pytest
 import tifffile
 from numpy.testing import assert_allclose, assert_array_equal
-from onnx import TensorProto, helper
 
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.quant.samples.own import OwnSamples, read_samples, samples_of
 from beers_deploy.quant.samples.patches import Regenerated
 from beers_deploy.quant.tiling.receptive_field import tiling_of
+from tests.quant.quick import fix_sizes
 from tests.quant.simplify.networks import parsed
 
 SHAPE = (3, 2, 150, 137)
@@ -197,10 +197,8 @@ def test_networks_that_simulated_patches_do_not_suit_ask_for_samples() -> None:
     assert samples.all.degraded[0].shape == (1, 4, 128, 128)
     pooled = network(1)
     pooled.graph.node[0].op_type = "GlobalAveragePool"
-    dims: list[str | int | None] = ["N", 1, 32, 32]
     for value in (*pooled.graph.input, *pooled.graph.output):
-        fixed = helper.make_tensor_value_info(value.name, TensorProto.FLOAT, dims)
-        value.CopyFrom(fixed)
+        fix_sizes(value, 32, 32)
     with pytest.raises(OptionError, match="only images of 32 x 32 pixels"):
         samples_of(pooled, None)
 

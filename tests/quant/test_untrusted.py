@@ -22,6 +22,7 @@ from beers_deploy.quant.tiling.receptive_field import tiling_of
 from beers_deploy.quant.untrusted import FILE_BYTES
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 from tests.project_files import ROOT
+from tests.quant.quick import fix_sizes
 from tests.quant.simplify.networks import parsed
 
 Change = Callable[[onnx.ModelProto], object]
@@ -74,11 +75,7 @@ def stating(*dims: int) -> Change:
 
 
 def sized(*dims: int) -> Change:
-    def change(model: onnx.ModelProto) -> None:
-        for dim, size in zip(model.graph.input[0].type.tensor_type.shape.dim, dims, strict=True):
-            dim.dim_value = size
-
-    return change
+    return lambda model: fix_sizes(model.graph.input[0], *dims)
 
 
 def typed(kind: int) -> Change:

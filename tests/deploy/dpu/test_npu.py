@@ -20,6 +20,7 @@ from tests.deploy.documents import figures_of, valid
 from tests.deploy.dpu.draws import rules_of
 from tests.deploy.dpu.graphs import QdqSketch, behind_qdq_conv
 from tests.model.networks import plain
+from tests.quant.quick import fix_sizes
 
 Draw = Callable[[QdqSketch, str], str]
 
@@ -54,9 +55,9 @@ def write_network(path: Path, draw: Draw, opset: int = 17, side: int | None = 31
     """Write a file with `draw` behind a convolution, for images of `side` or of any size."""
     model = onnx.load(behind_qdq_conv(path, draw))
     model.opset_import[0].version = opset
-    for value in (*model.graph.input, *model.graph.output) if side else ():
-        for dim, size in zip(value.type.tensor_type.shape.dim, (1, 4, side, side), strict=True):
-            dim.dim_value = size or 0
+    if side:
+        for value in (*model.graph.input, *model.graph.output):
+            fix_sizes(value, 1, 4, side, side)
     onnx.save(model, path)
     return path
 

@@ -10,6 +10,7 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.encodings import BORDER_PX, PLACE_PX, board_model
 from beers_deploy.quant.onnx_file import metadata, save_onnx
 from tests.deploy.dpu.graphs import Sketch, board_convbeers
+from tests.quant.quick import fix_sizes
 from tests.quant.tiling.small_networks import quantized_half_resolution
 
 
@@ -38,8 +39,7 @@ def test_an_unknown_operator_hides_the_shape_but_not_the_network(tmp_path: Path)
 
 def test_a_model_fixed_to_another_tile_is_refused_with_its_tile(tmp_path: Path) -> None:
     sketch = Sketch(2)
-    for dimension in sketch.input.type.tensor_type.shape.dim[2:]:
-        dimension.dim_value = 48
+    fix_sizes(sketch.input, 48, 48)
     path = sketch.save(tmp_path / "f.onnx", sketch.conv("image", (2, 2, 3, 3)))
     assert read_network(path, 48).operations[0].out_shape == (2, 48, 48)
     with pytest.raises(ModelError, match="`tile` 48"):

@@ -27,6 +27,7 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import board_names, npu_names
 from tests.deploy.dpu.graphs import integer_convbeers
 from tests.profiles.own_sensor import departing
+from tests.quant.quick import fix_sizes
 
 
 def bench(model: Path, target: str = "vck190", **options: Any) -> Bench:
@@ -60,8 +61,7 @@ def classifier(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     network = nn.Sequential(features, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(64, 10))
     model = bd.Network.load(network, example=(1, 1, 32, 32)).model
-    for side in model.graph.input[0].type.tensor_type.shape.dim[2:]:
-        side.dim_value = 32
+    fix_sizes(model.graph.input[0], 32, 32)
     onnx.save(model, path)
     return path
 

@@ -13,7 +13,7 @@ from onnx.reference import ReferenceEvaluator
 
 from beers_deploy.quant.graph import read_network, refusal
 from beers_deploy.quant.simplify.simplify import simplify
-from tests.quant.quick import assert_same, run_model
+from tests.quant.quick import assert_same, fix_sizes, run_model
 from tests.quant.simplify.networks import CHANNELS, CONV, SAME, network_from
 
 IMAGE = np.random.default_rng(4).uniform(0, 1, (1, CHANNELS, 18, 23)).astype(np.float32)
@@ -21,10 +21,7 @@ IMAGE = np.random.default_rng(4).uniform(0, 1, (1, CHANNELS, 18, 23)).astype(np.
 
 def sized(model: onnx.ModelProto, rows: int, columns: int) -> onnx.ModelProto:
     """Return the network fixed to a size, with the sizes of its inner tensors, as exporters do."""
-    for dim, side_px in zip(
-        model.graph.input[0].type.tensor_type.shape.dim[2:], (rows, columns), strict=True
-    ):
-        dim.dim_value = side_px
+    fix_sizes(model.graph.input[0], rows, columns)
     model.graph.output[0].type.tensor_type.ClearField("shape")
     return onnx.shape_inference.infer_shapes(model)
 

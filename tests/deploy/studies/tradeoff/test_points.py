@@ -43,6 +43,7 @@ from beers_deploy.studies.tradeoff.run import require_quantizable
 from tests.deploy.dpu.graphs import integer_convbeers
 from tests.deploy.studies.tradeoff.synthetic import DPU
 from tests.model.networks import plain
+from tests.quant.quick import fix_sizes
 
 WHOLE = Swath(13600, 9016)
 SENSOR = Sensor.load("pleiades-degraded")
@@ -96,8 +97,7 @@ def test_other_names_and_two_files_of_one_name_are_refused(tmp_path: Path) -> No
 
 def test_a_network_of_one_tile_size_is_refused(tmp_path: Path) -> None:
     model = onnx.load(float_file(tmp_path / "net.onnx"))
-    for side in (2, 3):
-        model.graph.input[0].type.tensor_type.shape.dim[side].dim_value = 64
+    fix_sizes(model.graph.input[0], 64, 64)
     onnx.save(model, tmp_path / "fixed.onnx")
     with pytest.raises(OptionError, match="fixed to one tile size"):
         network_variants([str(tmp_path / "fixed.onnx")], SENSOR, refused)
