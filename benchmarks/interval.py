@@ -44,12 +44,10 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
 from beers_deploy.quant.sensor_bank.conditioned import WEIGHTS
 from beers_deploy.restoration.interval import interval_of
-from beers_deploy.restoration.steps import BOTH
 from beers_deploy.studies.evaluation.calibrate import write_with_interval
-from beers_deploy.studies.evaluation.methods import network_restore, profile_of
+from benchmarks.self_check import NOMINAL as LIKE
+from benchmarks.self_check import REFERENCE, restorer
 
-LIKE = Sensor.load("pleiades-degraded")
-REFERENCE = Sensor.load("pleiades-reference").nominal()
 FAMILY = SensorFamily(LIKE.nominal(), other_curves=0.3)
 RECIPES = SHIPPED.parent / "recipes"
 
@@ -140,9 +138,7 @@ def acquired(
 
 def restored(name: str, image: Acquired) -> np.ndarray:
     """Restore an acquisition by a shipped network that knows its sensor."""
-    profile = profile_of(image.sensor, LIKE)
-    network = Network.load(name, sensor=profile)
-    return network_restore(network, profile, REFERENCE, BOTH)(image.raw)
+    return restorer(name, image.sensor)(image.raw)
 
 
 def training_images(folders: Iterable[Path]) -> tuple[list[Acquired], list[Acquired]]:

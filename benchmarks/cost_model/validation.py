@@ -89,9 +89,8 @@ class Nested:
 @cache
 def nested(board: str) -> Nested:
     """Predict each family with a contention exponent, constants and widths from the others."""
-    names = _trial(board, chosen(board)).names
-    predicted = [_trial(board, chosen(board, name)).left_out(name) for name in names]
     trial = _trial(board, chosen(board))
+    predicted = [_trial(board, chosen(board, name)).left_out(name) for name in trial.names]
     cases = trial.cases
     by_case = {(row.network, row.configuration): row for row in chain.from_iterable(predicted)}
     rows = [by_case[row.network, row.configuration] for row in cases.rows]
