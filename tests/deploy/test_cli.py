@@ -20,8 +20,6 @@ from beers_deploy.profiles.errors import CRASHED
 from tests.deploy.command_line import done, refused
 from tests.profiles.own_sensor import SHIPPED, edited, own_sensor
 
-runner = CliRunner()
-
 
 def acquisition(path: Path, height: int = 37, width: int = 61) -> Path:
     dn = np.random.default_rng(0).integers(200, 1800, (height, width))
@@ -31,7 +29,7 @@ def acquisition(path: Path, height: int = 37, width: int = 61) -> Path:
 
 def fails(arguments: list[str], *words: str) -> None:
     """Check that a command ends with 2 and one message with these words, without a traceback."""
-    result = runner.invoke(app, arguments)
+    result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 2, result.output
     *log, message = result.stderr.strip().splitlines()
     assert message.startswith("beers-deploy: ")
@@ -101,7 +99,7 @@ def test_a_value_that_an_option_does_not_accept_is_named(words: str, reason: str
 
 
 def test_version() -> None:
-    assert runner.invoke(app, ["--version"]).output == f"beers-deploy {__version__}\n"
+    assert done("--version") == f"beers-deploy {__version__}\n"
 
 
 def test_the_verbose_version_lists_libraries_and_int8_kernels() -> None:

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from beers_deploy.cli.commands import COMMANDS, app
 from beers_deploy.results import Table
+from tests.deploy.command_line import done
 from tests.deploy.verb_parameters import options
 
 JSON = "json"
@@ -211,7 +212,7 @@ def test_a_command_refused_for_its_input_leaves_no_new_folder(
         values |= dict.fromkeys(inputs_of(name)[:1], source)
     command = command_with(name, tmp_path, **values)
     before = state(tmp_path)
-    assert CliRunner().invoke(app, command).exit_code == 2, command
+    done(*command, code=2)
     assert state(tmp_path) == before, command
 
 
@@ -262,9 +263,8 @@ def test_figures_of_an_earlier_run_next_to_the_images_are_replaced(tmp_path: Pat
     """The rule does not stop a job that is run twice: it gets as far as reading the images."""
     existing(tmp_path / "scenes" / "scene.png")
     figures = Table(command="evaluate").save(tmp_path / "scenes" / "figures.json")
-    result = CliRunner().invoke(app, f"evaluate --images {figures.parent} --json {figures}".split())
-    assert result.exit_code == 2
-    assert "scene.png" in result.stderr
+    output = done(f"evaluate --images {figures.parent} --json {figures}", code=2)
+    assert "scene.png" in output
 
 
 @pytest.mark.parametrize("command", ["evaluate", "simulate"])
