@@ -2,8 +2,8 @@
 
 1. The nodes that flatten a map of known size are recorded: Flatten, Reshape and Squeeze.
 2. A Gemm on such a map becomes a convolution of the whole map.
-3. Activations on a flat tensor are applied to the map instead, and a Softmax over a flat tensor
-   becomes one along the channels of one pixel.
+3. Activations of a flat tensor, and its arithmetic with one number, are applied to the map instead,
+   and a Softmax over a flat tensor becomes one along the channels of one pixel.
 4. A Reshape that restores the map is removed, and the flattening with it.
 5. A convolution along the channels of one pixel, as in efficient channel attention (ECA), becomes a
    convolution of that pixel that connects neighbouring channels.
@@ -18,6 +18,7 @@ import numpy as np
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 
 POINTWISE = {"Clip", "Elu", "HardSigmoid", "HardSwish", "LeakyRelu", "Relu", "Sigmoid", "Tanh"}
+ARITHMETIC = {"Add", "Div", "Mul", "Sub"}
 MOVES = {"Flatten", "Reshape", "Squeeze", "Transpose", "Unsqueeze"}
 Map = tuple[int, int, int]
 """Channels, height, width."""
@@ -50,7 +51,9 @@ class ConnectByConvolutions:
         if node.op_type == "Softmax" and is_over_channels:
             softmax = Node.new("Softmax", [source], node.result, node.proto.name, axis=1)
             return self._flat(softmax, size)
-        if node.op_type in POINTWISE:
+        operand = graph.value(node, 1)
+        is_scaled = node.op_type in ARITHMETIC and operand is not None and operand.size == 1
+        if node.op_type in POINTWISE or is_scaled:
             image = Node.of(node.written())
             image.inputs = (source, *node.inputs[1:])
             return self._flat(image, size)

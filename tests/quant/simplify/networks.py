@@ -282,6 +282,12 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         y = Unsqueeze(g, axes)""",
         {"GlobalAveragePool": 1, "Conv": 1, "Flatten": 1, "Unsqueeze": 1},
     ),
+    "a mean, scaled and restored to a map": (
+        """m = ReduceMean<axes=[2,3], keepdims=0>(x)
+        d = Mul(m, six)
+        y = Reshape(d, map_again)""",
+        {"GlobalAveragePool": 1, "Mul": 1},
+    ),
     "a mean over channels": ("y = ReduceMean<axes=[1]>(x)", {"Conv": 1}),
     "the largest channel": ("y = ReduceMax<axes=[1]>(x)", {"Conv": 4, "Relu": 2, "Add": 2}),
     "the largest of three channels": (
