@@ -45,7 +45,7 @@ from beers_deploy.quant.onnx_file import (
     with_one_output,
 )
 from beers_deploy.quant.session import open_session, result_of
-from beers_deploy.quant.tiling.receptive_field import Tiling, tiling_of
+from beers_deploy.quant.tiling.receptive_field import Tiling, geometry_of
 from beers_deploy.quant.untrusted import times
 from beers_deploy.results import Input, Table
 
@@ -295,7 +295,7 @@ class Network:
         """The precision, "float32" or "int8"."""
         return "int8" if is_quantized(self.model) else "float32"
 
-    @cached_property
+    @property
     def tiling(self) -> Tiling:
         """The geometry by which large images are cut into tiles for this network.
 
@@ -306,7 +306,19 @@ class Network:
             ModelError: the network cannot be tiled, for example because an operator reads the whole
                 image.
         """
-        return tiling_of(self.model, self.label)
+        if self.geometry.reads_whole:
+            raise ModelError(self.geometry.reads_whole)
+        return self.geometry
+
+    @cached_property
+    def geometry(self) -> Tiling:
+        """The tiling, or that of independent tiles for a network of fixed size that reads its whole
+        tile.
+
+        Raises:
+            ModelError: the network cannot be applied to tiles.
+        """
+        return geometry_of(self.model, self.label)
 
     @property
     def sensor(self) -> str:

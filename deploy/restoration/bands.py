@@ -174,7 +174,7 @@ def require_alike(networks: Sequence[Network]) -> None:
         networks: one network for all bands, which is accepted, or one for each. Several must read
             one band each and have equal tilings: halo, stride, scale, bands and accepted sizes.
     """
-    tilings = [network.tiling for network in networks]
+    tilings = [network.geometry for network in networks]
     if len(networks) > 1 and (len(set(map(repr, tilings))) > 1 or tilings[0].channels_in != 1):
         raise ModelError(
             "Networks for single bands must each have one band and differ only in their weights, "

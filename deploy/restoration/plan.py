@@ -273,8 +273,10 @@ class Plan:
         """The halo in pixels as text, with a note if it is smaller than the receptive radius, so
         that seams between tiles are not exact.
         """
-        if self.halo_px >= self.radius_px:
+        if self.halo_px >= self.radius_px or self.tiles == self.groups == 1:
             return f"{self.halo_px} px (exact)"
+        if self.tiling.reads_whole:
+            return f"{self.halo_px} px (seams: the network reads its whole tile)"
         return f"{self.halo_px} px (seams: exact is {self.radius_px})"
 
     @property
@@ -301,10 +303,11 @@ def plan_for(network: Network, shape: tuple[int, int, int], tiles: Tiles) -> Pla
 
     Raises:
         OptionError: the tile size, the halo or the number of bands does not fit the network, or the
-            network is fixed to one tile size, and `tiles` states another or the image is smaller.
+            network is fixed to one tile size, and `tiles` states another or the image is smaller,
+            or it reads its whole tile, the image is larger and no halo is given.
         ModelError: the network returns an image whose size is no multiple of the image's.
     """
-    tiling = network.tiling
+    tiling = network.geometry
     _, height_px, width_px = shape
     if tiling.fixed_px is not None and (
         tiling.fixed_px != tiles.side_px or min(shape[1:]) < tiling.fixed_px
@@ -314,7 +317,15 @@ def plan_for(network: Network, shape: tuple[int, int, int], tiles: Tiles) -> Pla
             f"image at least as large, got {tiles.side_px} px and an image of {width_px} x "
             f"{height_px} pixels. Use a network with free sizes."
         )
-    return make_plan(shape, tiles.side_px, parse_halo(tiles.halo, tiling.halo_px), tiling)
+    halo_px = parse_halo(tiles.halo, tiling.halo_px)
+    if tiling.reads_whole and tiles.halo == "exact":
+        if shape[1:] != (tiling.fixed_px, tiling.fixed_px):
+            raise OptionError(
+                f"{tiling.reads_whole} To restore tiles independently, with seams between them, "
+                "give `halo` a number of pixels, such as 8."
+            )
+        halo_px = 0
+    return make_plan(shape, tiles.side_px, halo_px, tiling)
 
 
 def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, tiling: Tiling) -> Plan:

@@ -199,7 +199,7 @@ def write_network_item(network: Network, path: Path, when: datetime) -> None:
         datetime=when,
         properties={"description": "a network that restores images; datetime is the time of a run"},
     )
-    tiling = network.tiling
+    tiling = network.geometry
     tasks = [mlm.TaskType.REGRESSION]
     if tiling.scale > 1:
         tasks.append(mlm.TaskType.SUPER_RESOLUTION)

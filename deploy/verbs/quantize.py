@@ -236,7 +236,11 @@ def _notes(result: "Network", adapt: bool) -> list[str]:
     if adapt and ADAPTED not in about:
         notes.append("`adapt` replaced nothing: the DPU computes all operators of the network")
     try:
-        _ = result.tiling
+        if reason := result.geometry.reads_whole:
+            notes.append(
+                "`restore` restores its tiles independently, with seams, and `bench` counts whole "
+                f"images: {reason}"
+            )
     except ModelError as error:
         notes.append(f"`restore` does not run it, and `bench` counts whole images: {error}")
     return notes

@@ -28,6 +28,7 @@ from fractions import Fraction
 import onnx
 from onnx import TypeProto
 
+from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph.pixel_shuffle import MOVES, with_shuffles
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
 from beers_deploy.quant.onnx.image_input import fixed_tile_px
@@ -53,6 +54,8 @@ class Tiling:
         fixed_px: the side of the image that the network is fixed to; None if it accepts any size.
         min_side_px: the shortest side of an image that it accepts: one pixel more than it mirrors
             at a border.
+        reads_whole: why each pixel depends on the whole tile, so that no halo gives the result of
+            the whole image; empty otherwise.
     """
 
     halo_px: int
@@ -62,6 +65,7 @@ class Tiling:
     channels_out: int = 1
     fixed_px: int | None = None
     min_side_px: int = 1
+    reads_whole: str = ""
 
     def whole_px(self, side_px: int) -> int:
         """Return the length in pixels to which a side of an image is extended, at the bottom or
@@ -115,6 +119,35 @@ def tiling_of(model: onnx.ModelProto, where: str = "") -> Tiling:
         return Tiling(
             halo_px, alignment_px, rows.scale, channels_in, channels_out, fixed_px, min_side_px
         )
+
+
+def geometry_of(model: onnx.ModelProto, where: str = "") -> Tiling:
+    """Determine how an image may be cut into tiles, as `tiling_of` does, also for a network of
+    fixed size that reads its whole tile, such as by squeeze and excite.
+
+    Its tiles are restored independently: the radius is the tile.
+
+    Args:
+        model: the network.
+        where: the name of the network for messages.
+
+    Raises:
+        ModelError: the network cannot be tiled, and is not fixed to the size of one tile and to
+            that of its result.
+    """
+    try:
+        return tiling_of(model, where)
+    except ModelError as error:
+        fixed_px = fixed_tile_px(model)
+        graph = OnnxGraph(model)
+        (name, *others) = graph.outputs
+        sizes = graph.result_sizes[name]
+        if fixed_px is None or others or len(sizes) != 4 or not sizes[2] or sizes[2] != sizes[3]:
+            raise
+        channels_in, channels_out = _channels(graph)
+        scale = Fraction(sizes[2], fixed_px)
+        reason = str(error)
+        return Tiling(fixed_px, 1, scale, channels_in, channels_out, fixed_px, reads_whole=reason)
 
 
 def _channels(graph: OnnxGraph) -> tuple[int, int]:

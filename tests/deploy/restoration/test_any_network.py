@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
-from numpy.testing import assert_array_equal
-from onnx import helper
+from numpy.testing import assert_allclose, assert_array_equal
+from onnx import helper, numpy_helper
 
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
@@ -190,6 +190,33 @@ def test_what_cannot_be_restored_is_refused_in_one_sentence(
     with pytest.raises(error, match=sentence):
         by_file(np.ones((30, 30), np.uint16), tmp_path, path, 40)
     assert not (tmp_path / "out.tif").exists()
+
+
+def test_tiles_of_a_network_that_reads_its_whole_tile_are_independent(tmp_path: Path) -> None:
+    """An image of one tile is restored as it is, a larger one only with a halo that is given."""
+    half = numpy_helper.from_array(np.float32(0.5), "half")
+    nodes = [
+        helper.make_node("GlobalAveragePool", ["image"], ["mean"], name="pool"),
+        helper.make_node("Add", ["image", "mean"], ["sum"], name="add"),
+        helper.make_node("Mul", ["sum", "half"], ["restored"], name="halve"),
+    ]
+    model = graph(nodes, half)
+    for value in (*model.graph.input, *model.graph.output):
+        for side in value.type.tensor_type.shape.dim[2:]:
+            side.dim_value = 32
+    path = saved(model, tmp_path)
+
+    def halved(pixels: np.ndarray) -> np.ndarray:
+        return np.rint((pixels + pixels.mean()) / 2)
+
+    pixels = np.random.default_rng(3).integers(1, 4096, (70, 50)).astype(np.uint16)
+    tile = pixels[:32, :32]
+    assert_allclose(by_file(tile, tmp_path, path, 32), halved(tile), atol=1)
+    with pytest.raises(OptionError, match=r"pool reads the whole image.* give `halo`"):
+        by_file(pixels, tmp_path, path, 32)
+    result = by_file(pixels, tmp_path, path, 32, halo="4")
+    assert_allclose(result[:28, :28], halved(tile)[:28, :28], atol=1)
+    assert_allclose(result[52:, 28:], halved(pixels[38:, 18:])[14:, 10:], atol=1)
 
 
 def test_halos_that_are_not_aligned_are_refused_and_tiles_rounded() -> None:
