@@ -31,7 +31,7 @@ from beers_deploy.quant.gate import GateResult, compare, gate_row
 from beers_deploy.quant.integer.agreement import integer_rows
 from beers_deploy.quant.onnx_file import faults_named, load_onnx, metadata, require_quantized
 from beers_deploy.quant.passes.effort import Effort
-from beers_deploy.quant.passes.selection import ALL
+from beers_deploy.quant.passes.selection import ALL, Passes
 from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.samples.own import OwnSamples
 from beers_deploy.quant.sensitivity import (
@@ -308,6 +308,7 @@ def family_model(
     seed: int = 0,
     shifts: Shifts = SHIFTS,
     effort: Effort = Effort.normal,
+    passes: Passes = ALL,
 ) -> onnx.ModelProto:
     """Quantise a sensor-conditioned network with one calibration for the whole family of sensors.
 
@@ -320,6 +321,8 @@ def family_model(
         seed: the seed of the patches.
         shifts: the bit shifts that the target's arithmetic allows.
         effort: the effort of the search for equalisation factors.
+        passes: the passes that reduce the rounding error; by default all of them. The ablation
+            leaves out one at a time.
 
     Returns:
         The ONNX model for the sensor in the middle of the family. `int8_for_sensor` makes that of
@@ -340,7 +343,7 @@ def family_model(
     with progress(f"calibrating {network.name} over the family of sensors"):
         patches = bank_images(scenes, scale, seed, weights.kernels)
         middle = bank_of_vector((0.0,) * len(RANGES), weights.kernels)
-        quantized = quantize_behind_bank(weights, middle, patches, shifts, ALL, effort)
+        quantized = quantize_behind_bank(weights, middle, patches, shifts, passes, effort)
     description = {
         "variant": network.name,
         "reference": REFERENCE,

@@ -194,7 +194,7 @@ def test_what_cannot_be_restored_is_refused_in_one_sentence(
 
 def test_tiles_of_a_network_that_reads_its_whole_tile_are_independent(tmp_path: Path) -> None:
     """An image of one tile is restored as it is, a larger one only with a halo that is given."""
-    half = numpy_helper.from_array(np.float32(0.5), "half")
+    half = numpy_helper.from_array(np.array(0.5, np.float32), "half")
     nodes = [
         helper.make_node("GlobalAveragePool", ["image"], ["mean"], name="pool"),
         helper.make_node("Add", ["image", "mean"], ["sum"], name="add"),
@@ -207,7 +207,7 @@ def test_tiles_of_a_network_that_reads_its_whole_tile_are_independent(tmp_path: 
     path = saved(model, tmp_path)
 
     def halved(pixels: np.ndarray) -> np.ndarray:
-        return np.rint((pixels + pixels.mean()) / 2)
+        return np.asarray(np.rint((pixels + pixels.mean()) / 2))
 
     pixels = np.random.default_rng(3).integers(1, 4096, (70, 50)).astype(np.uint16)
     tile = pixels[:32, :32]
