@@ -26,7 +26,7 @@ ROUNDINGS: dict[str, Callable[[float], int]] = {
     "round_prefer_ceil": lambda place: math.floor(place + 0.5),
 }
 
-BY_2_OR_4 = (1, 1, 2, 2), (1, 1, 4, 4)
+BY_2_OR_4: tuple[tuple[float, ...], ...] = ((1, 1, 2, 2), (1, 1, 4, 4))
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def enlarges_image(graph: OnnxGraph, node: Node) -> bool:
     attribute = node.attributes.get
     is_plain = attribute("cubic_coeff_a", CUBIC) == CUBIC and not attribute("exclude_outside", 0)
     is_cubic = resizing.mode == "cubic" and resizing.is_half_pixel and is_plain
-    return is_cubic and resizing.factors in BY_2_OR_4 and node.inputs[0] in graph.inputs
+    return is_cubic and resizing.factors in BY_2_OR_4 and node.source in graph.inputs
 
 
 def alone_enlarges_image(graph: OnnxGraph, node: Node) -> bool:

@@ -555,7 +555,11 @@ def enlarging(mode: str, where: str, factor: int, adds: bool) -> onnx.ModelProto
     """Build two convolutions of the enlarged image, which adds the result to it if asked."""
     w = GraphWriter()
     scales = w.constant("scales", np.array([1, 1, factor, factor], np.float32))
-    attributes: dict[str, Any] = {"mode": mode, "coordinate_transformation_mode": where, "cubic_coeff_a": -0.75}
+    attributes: dict[str, Any] = {
+        "mode": mode,
+        "coordinate_transformation_mode": where,
+        "cubic_coeff_a": -0.75,
+    }
     wide = w.node("Resize", "wide", ["image", "", scales], **attributes)
     first = w.node("Relu", "first", [conv(w, wide, "a", IMAGE_WEIGHTS)])
     correction = conv(w, first, "b", RESULT_WEIGHTS)
