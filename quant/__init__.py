@@ -17,19 +17,13 @@ float ONNX (`onnx_file`) -> `graph` -> `samples` -> `passes` -> integer `core` -
 import os
 import sys
 
-
-def _switch_off_telemetry() -> None:
-    """Prevent onnxruntime and OpenVINO from reporting their use.
-
-    onnxruntime's wheels (1.29 and later) store an identifier in the home folder and send events
-    from native code. That begins when the library is loaded, so its switch must be set before.
-    OpenVINO reports its import through another package. If that cannot be imported, it uses a stub
-    of its own. An earlier choice of the user is respected.
-    """
-    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-    absent: dict[str, object] = sys.modules  # type: ignore[assignment]  # None is Python's mark for "do not import"
-    absent.setdefault("openvino_telemetry", None)
-
-
-# Here, because a runtime's first import anywhere in this package is too late.
-_switch_off_telemetry()
+# Prevent onnxruntime and OpenVINO from reporting their use. This is done here, because a runtime's
+# first import anywhere in this package is too late.
+#
+# onnxruntime's wheels (1.29 and later) store an identifier in the home folder and send events from
+# native code. That begins when the library is loaded, so its switch must be set before. OpenVINO
+# reports its import through another package. If that cannot be imported, it uses a stub of its own.
+# An earlier choice of the user is respected.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+_absent: dict[str, object] = sys.modules  # type: ignore[assignment]  # None is Python's mark for "do not import"
+_absent.setdefault("openvino_telemetry", None)

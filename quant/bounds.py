@@ -63,7 +63,7 @@ def layer_bounds(core: IntCore) -> list[LayerBound]:
     """
     channels = core.host_part.channels
     first, last = (np.repeat(end, channels) for end in core.host_part.encoding.limits)
-    ranges: dict[str, Range] = {PLANES: (first, last)}
+    ranges = {PLANES: (first, last)}
     bounds = []
     for op in core.ops:
         low, high, shift = _accumulated(core, op, ranges)

@@ -190,7 +190,7 @@ def compare(
     contrasts = []
     errors = []
     metric_values = []
-    unfit = list[int]()
+    unfit = []
     for number, (degraded, reference) in enumerate(patches.pairs):
         in_float, in_int8, ranges = _results(float_session, int8_session, degraded, patches.ranges)
         degraded = to_shares(degraded, patches.ranges)

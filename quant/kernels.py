@@ -305,7 +305,7 @@ def _widen(graph: OnnxGraph, node: Node) -> list[Node] | None:
     weight = graph.value(node, 3) if node.op_type == "QLinearConv" else None
     middle = graph.value(node, 5)
     # A stored 0 must be a weight of 0, and each output read every input.
-    is_plain = middle is not None and not middle.any() and node.attributes.get("group", 1) == 1
+    is_plain = middle is not None and not middle.any() and node.groups == 1
     if weight is None or weight.ndim != 4 or not is_plain:
         return None
     n_outputs, n_inputs = weight.shape[:2]

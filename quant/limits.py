@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.figures import Check
@@ -116,7 +116,7 @@ def limits_of(
         raise OptionError(
             f"{where} must set at least one of {', '.join(BREAKABLE)}, for example mae = 0.0007."
         )
-    numbers: dict[str, Any] = {**values}
+    numbers = {**values}
     for name, value in numbers.items():
         if value is not None or name not in BREAKABLE:
             _require_breakable(where, name, value)
@@ -178,7 +178,7 @@ def judge(
     Returns:
         One check for each limit that is set, with the measured value and the limit.
     """
-    figures: list[tuple[str, float, float | None, str, str]] = [
+    figures = [
         ("MAE", result.mae, limits.mae, "of full scale", ""),
         ("99.9th percentile", result.p999, limits.p999, "of full scale", ""),
         ("std / MAE", result.std_over_mae, limits.std_over_mae, "ratio", ""),

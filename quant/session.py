@@ -113,7 +113,7 @@ def run(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:
     Raises:
         ModelError: the model does not run on this image, or returns another shape.
     """
-    restored = tensors_of(session, None, image)[0]
+    restored = result_of(session, image)
     if restored.shape != image.shape:
         raise _unfit(f"{times(image.shape)} values give {times(restored.shape)}")
     return restored

@@ -189,20 +189,19 @@ def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> on
         OptionError: `tile_px` is None.
     """
     side_px = required_tile(tile_px, OF_NPU)
-    parts: list[tuple[IntConv | Op, int]] = []
+    frac_bits = dict(core.frac_bits)
+    parts: list[IntConv | Op] = []
     for op in core.ops:
-        frac_bits = core.frac_bits[op.output]
         part = op
         if isinstance(op, IntConv | Add) and op.activation in CLAMPS:
             # An operation and its clamp share the scale of the result, so that no bit changes.
             inner = f"{op.output}.linear"
-            parts.append((replace(op, output=inner, activation=Activation.none), frac_bits))
+            frac_bits[inner] = frac_bits[op.output]
+            parts.append(replace(op, output=inner, activation=Activation.none))
             part = Pointwise(f"{op.name}.{op.activation.name}", inner, op.output, op.activation)
-        parts.append((part, frac_bits))
-    writer = _PairWriter(
-        {PLANES: core.frac_bits[PLANES], **{op.output: bits for op, bits in parts}}
-    )
-    for op, _ in parts:
+        parts.append(part)
+    writer = _PairWriter(frac_bits)
+    for op in parts:
         writer.operation(op, [writer.read(name) for name in op.inputs], writer.source(op.output))
     writer.read(CORRECTION, CORRECTION)
     model = _core_file(writer, core.host_part, about, side_px)

@@ -88,7 +88,7 @@ def implicit_parts(model: onnx.ModelProto) -> dict[str, list[str]]:
     for node in graph.node:
         tensors += node.output
     producer = {"name": model.producer_name, "version": model.producer_version}
-    unset = list[str]()
+    unset = []
     for node in graph.node:
         unset += [f"{node.name}: {attribute.name}" for attribute in _defaults(node, opset)]
     return {

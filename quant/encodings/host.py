@@ -73,17 +73,23 @@ def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None)
         about: metadata of the file, by key.
         tile_px: rows and columns of the one image that the file is fixed to; None for any size.
     """
+    host_part = core.host_part
     writer = HostWriter()
-    core.host_part.write_front(writer)
+    host_part.write_front(writer)
     for op in core.ops:
         _WRITERS[type(op)](writer, core, op)
     feeds = [CORRECTION, writer.unit(core.frac_bits[CORRECTION]), writer.zero_point()]
-    core.host_part.write_back(writer, feeds, core.scale(CORRECTION))
-    graph = writer.graph(
-        "convbeers-int8",
-        [image_info(IMAGE, core.host_part.image_channels, tile_px)],
-        [_result(core, tile_px)],
+    host_part.write_back(writer, feeds, core.scale(CORRECTION))
+    image, result = (
+        image_info(name, host_part.image_channels, tile_px) for name in (IMAGE, "restored")
     )
+    if not host_part.adds_image or host_part.last or host_part.base != THE_IMAGE:
+        shuffles = (*host_part.back, *host_part.last)
+        channels = host_part.outputs // math.prod(shuffle.block**2 for shuffle in shuffles)
+        result = onnx.helper.make_tensor_value_info(
+            "restored", TensorProto.FLOAT, ["N", channels, "rows", "columns"]
+        )
+    graph = writer.graph("convbeers-int8", [image], [result])
     model = make_model(graph, {**about, KEY: describe(core)}, microsoft=True)
     onnx.helper.set_model_props(model, {**metadata(model), CHECKSUM: checksum(model)})
     return model
@@ -132,16 +138,6 @@ def live_tensors(core: IntCore, at: int) -> list[str]:
     written = [PLANES, *(op.output for op in core.ops[:at])]
     reads = {CORRECTION, *chain.from_iterable(op.inputs for op in core.ops[at:])}
     return [name for name in written if name in reads]
-
-
-def _result(core: IntCore, tile_px: int | None) -> onnx.ValueInfoProto:
-    host_part = core.host_part
-    if host_part.adds_image and not host_part.last and host_part.base == THE_IMAGE:
-        return image_info("restored", host_part.image_channels, tile_px)
-    shuffles = (*host_part.back, *host_part.last)
-    squares = math.prod(shuffle.block**2 for shuffle in shuffles)
-    sizes: list[str | int | None] = ["N", host_part.outputs // squares, "rows", "columns"]
-    return onnx.helper.make_tensor_value_info("restored", TensorProto.FLOAT, sizes)
 
 
 def _conv(w: HostWriter, core: IntCore, op: IntConv) -> None:
@@ -267,7 +263,7 @@ def _transposed(w: HostWriter, core: IntCore, op: IntConv) -> None:
 
 
 def _add(w: HostWriter, core: IntCore, op: Add | Mul) -> None:
-    feeds: list[str] = []
+    feeds = []
     for name in op.inputs:
         feeds += [name, w.unit(core.frac_bits[name]), w.zero_point()]
     feeds += [w.unit(core.frac_bits[op.output]), w.zero_point()]
@@ -381,7 +377,7 @@ def encoding_faults(model: onnx.ModelProto) -> list[str] | None:
         return [f"no integers to compare with: {error}"]
     with contradictions("the INT8 network"):
         expected = host_model(core, {}, fixed_tile_px(model)).graph
-        faults = list[str]()
+        faults = []
     for kind, parts, expected_parts in (
         ("constant", model.graph.initializer, expected.initializer),
         ("node", model.graph.node, expected.node),

@@ -75,7 +75,7 @@ def aligned(graph: OnnxGraph, node: Node) -> dict[Node, list[Node]]:
         return {}
     # 1. Pads put each value in the middle of the eight pixels that it stands for, or next to it.
     changes = {0: {"pads": [1, 1, 1, 1]}, 1: {"strides": [4, 4], "pads": [1, 1, 2, 2]}}
-    replacements: dict[Node, list[Node]] = {}
+    replacements = {}
     source = nodes[0].source
     for place, old in enumerate(nodes):
         # Another name, because it is not the tensor of the original any more.

@@ -56,7 +56,7 @@ def _read_conv(node: Node, graph: OnnxGraph) -> Op:
         f"must be a convolution over rows and columns, but its weights have {weight.ndim} "
         "dimensions",
     )
-    groups = int(node.attributes.get("group", 1))
+    groups = node.groups
     transposed = node.op_type == "ConvTranspose"
     if transposed:
         weight = np.ascontiguousarray(weight.swapaxes(0, 1))

@@ -211,7 +211,7 @@ class Integers:
             "weight", "bias", "constant 1" and "output". If the file contradicts itself, a tensor
             has several formats, that of its writer first. It has none if the file states none.
         """
-        formats: dict[str, tuple[Scale, ...]] = {}
+        formats = {}
         if self.is_integer(node):
             tensors = {f"input {i}": name for i, name in enumerate(self.activations(node))}
             result = node.result
@@ -300,7 +300,7 @@ class Integers:
         """Map each tensor to the int8 tensor to which it is rounded next, directly or behind
         activations.
         """
-        int8_names: dict[str, str] = {}
+        int8_names = {}
         for node in reversed(self._graph.nodes):
             readers = self._graph.readers.get(node.result, [])
             kinds = {reader.op_type for reader in readers}

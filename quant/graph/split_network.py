@@ -147,7 +147,7 @@ def cut(graph: Graph, channels: int, with_sum: bool = True) -> SplitNetwork:
     else:
         back = last
         last = ()
-    front: list[Shuffle] = []
+    front = []
     while len(readers := [op for op in graph if IMAGE in op.inputs]) == 1:
         (first,) = readers
         if not isinstance(first, Shuffle) or first.up:

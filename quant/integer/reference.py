@@ -221,8 +221,7 @@ def _moving(core: IntCore, op: Op, inputs: list[np.ndarray]) -> np.ndarray:
         return op(inputs[0])
     assert isinstance(op, Pointwise)  # noqa: S101
     # 256 values can enter, so the function is a table; its first entry is that of -128.
-    table: np.ndarray = activation_table(op, core.frac_bits)
-    return np.asarray(table[inputs[0] - INT8_MIN])
+    return np.asarray(activation_table(op, core.frac_bits)[inputs[0] - INT8_MIN])
 
 
 def _conv(core: IntCore, op: IntConv, image: np.ndarray, faults: Faults) -> Sums:

@@ -143,6 +143,11 @@ class Node:
         return (rows, columns), window
 
     @property
+    def groups(self) -> int:
+        """The number of groups of a convolution."""
+        return int(self.attributes.get("group", 1))
+
+    @property
     def output_padding(self) -> Sequence[int]:
         """The numbers of rows and columns that a transposed convolution adds at the end of its
         result.
@@ -212,7 +217,7 @@ class OnnxGraph:
         Args:
             rewriting: the pass, a function of the graph and a node; None leaves the node as it is.
         """
-        nodes: list[Node] = []
+        nodes = []
         for node in self.nodes:
             replacement = rewriting(self, node)
             new_nodes = [node] if replacement is None else replacement
@@ -228,7 +233,7 @@ class OnnxGraph:
         Nodes that lead to no output are dropped.
         """
         needed = set(self.outputs)
-        nodes: list[Node] = []
+        nodes = []
         # Backwards, because a node is needed only where something behind it reads its result.
         for node in reversed(self.nodes):
             if needed.intersection(node.outputs):

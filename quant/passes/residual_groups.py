@@ -93,7 +93,7 @@ def _placed(linking: Sequence[Op], names: Sequence[str], graph: Graph) -> Residu
     planes = next(op.weight.shape[1] for op in graph if isinstance(op, Conv))
     widths = channels_of(graph, {PLANES: planes})
     # Each input, the output, and where the input's channels stand in the output.
-    links: list[tuple[str, str, int]] = []
+    links = []
     for op in writers:
         before = accumulate((widths[name] for name in op.inputs[:-1]), initial=0)
         offsets = before if isinstance(op, Concat) else repeat(0, len(op.inputs))

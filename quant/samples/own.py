@@ -211,7 +211,7 @@ def read_samples(
     if isinstance(source, Path):
         label = str(source)
         name = source.name
-    samples = list[Named]()
+    samples = []
     min_side_px = fixed_px or max(min_side_px, multiple_px)
     for sample, image, reference in stored_samples(source, ranges or ()):
         pixels = _valid_image(sample, image, channels, ranges)

@@ -58,7 +58,7 @@ def samples_in(samples: object) -> list[Pair]:
             f"`{IN_MEMORY}` must be arrays (N, C, H, W) or a path, got {type(samples).__name__}. "
             f"{REMEDY}"
         )
-    pairs = list[Pair]()
+    pairs = []
     for item in samples:
         # A DataLoader returns a batch as a list: of images and references, or of images alone.
         batch = tuple(item) if isinstance(item, list) and len(item) == 2 else item

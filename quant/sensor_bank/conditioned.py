@@ -199,8 +199,8 @@ def delta_of_file(model: onnx.ModelProto) -> bytes:
     """
     conditioned = required_conditioned_core(model)
     core = conditioned.core
-    bits = dict[str, tuple[int, int]]()
-    arrays = list[np.ndarray]()
+    bits = {}
+    arrays = []
     for op in core.convolutions:
         if op.input == PLANES or op.name in conditioned.biases:
             bits[op.name] = (op.weight_frac_bits, op.bias_frac_bits)
@@ -242,7 +242,7 @@ def with_delta(core: IntCore, delta: bytes, where: str = "The delta") -> tuple[I
             raise ValueError("it was written for other weights")
         stream = BytesIO(numbers)
         bits = dict(header["bits"])
-        ops = list[IntConv | Op]()
+        ops = []
         for op in core.ops:
             if isinstance(op, IntConv) and op.name in bits:
                 weight_bits, bias_bits = map(int, bits.pop(op.name))

@@ -94,7 +94,7 @@ def channels(kernels: Kernels = "fitted") -> list[tuple[int, float]]:
     """
     coarse = coarse_copies(kernels)
     copies = [COPIES[0], *[COPIES[1]] * FILTERS, COPIES[2] - coarse, coarse]
-    outputs = list[tuple[int, float]]()
+    outputs = []
     for kernel, count in enumerate(copies):
         outputs += [(kernel, offset) for offset in spread_over_a_step(count)]
     return outputs
@@ -130,7 +130,7 @@ def integer_bank(bank: Bank, scale: int, gain: float, kernels: Kernels = "fitted
     frac_bits = int(np.floor(np.log2(LARGEST / np.abs(STEP_DN * steps).max())))
     exact = steps * 2.0**frac_bits
     residual = np.zeros_like(exact)
-    weights = list[NDArray[np.int64]]()
+    weights = []
     # Each further copy of a kernel makes up for the rounding errors of those before it.
     for kernel, _ in channels(kernels):
         if kernel:

@@ -49,7 +49,7 @@ def split_channels(graph: OnnxGraph, node: Node) -> list[Node] | None:
     source = node.source if parts else ""
     only_parts = all(_parts(graph, reader) for reader in graph.readers[source])
     divides = source not in graph.outputs and only_parts
-    nodes: list[Node] = []
+    nodes = []
     for name, channels in parts:
         nodes += _compute(graph, source, channels, name, divides)
     return nodes or None
@@ -91,7 +91,7 @@ def _compute(
     """
     before = graph.writers.get(source) if divides else None
     inner = f"{name}.before"
-    in_front: list[Node] = []
+    in_front = []
     is_pointwise = before is not None and before.op_type in POINTWISE
     groups = _groups(graph, before)
     if before is not None and (is_pointwise or groups > 1):
@@ -124,7 +124,7 @@ def _groups(graph: OnnxGraph, node: Node | None) -> int:
     if node is None or node.op_type != "Conv" or not is_convolution(graph, node):
         return 0
     outputs, inputs = graph.constants[node.inputs[1]].shape[:2]
-    groups = int(node.attributes.get("group", 1))
+    groups = node.groups
     # The channels of a group read others of their group, which the part need not have.
     return groups if groups == 1 or (groups == outputs and inputs == 1) else 0
 
@@ -144,8 +144,8 @@ def read_unselected(graph: OnnxGraph, node: Node) -> list[Node] | None:
     if joined is None or joined.op_type != "Concat":
         return None
     weight = graph.constants[node.inputs[1]]
-    parts: list[str] = []
-    columns: list[np.ndarray] = []
+    parts = []
+    columns = []
     first = 0
     for name in joined.inputs:
         width = graph.channels(name)
@@ -235,9 +235,7 @@ def join_copies(graph: OnnxGraph, node: Node) -> list[Node] | None:
             weights.append(graph.constants[conv.inputs[1]])
         else:
             return None
-        is_plain = conv is None or (
-            len(conv.inputs) == 2 and not conv.attributes.get("group", 1) > 1
-        )
+        is_plain = conv is None or (len(conv.inputs) == 2 and not conv.groups > 1)
         if weights[-1].shape[2:] != (1, 1) or not is_plain:
             return None
     return [graph.convolution(image, node.result, node.name, np.concatenate(weights))]

@@ -44,7 +44,7 @@ def without_groups(graph: OnnxGraph, node: Node) -> list[Node] | None:
     if not is_convolution(graph, node):
         return None
     weight = graph.constants[node.inputs[1]]
-    groups = node.attributes.get("group", 1)
+    groups = node.groups
     rows, columns, *_ = node.output_padding
     is_depthwise = node.op_type == "Conv" and weight.shape[1] == 1 and len(weight) == groups
     auto_pad = node.attributes.get("auto_pad", "NOTSET")
@@ -92,7 +92,7 @@ def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
     weight = graph.constants[node.inputs[1]]
     outputs, channels, rows, columns = weight.shape
     states_pads = node.attributes.get("auto_pad", "NOTSET") == "NOTSET"
-    channels *= node.attributes.get("group", 1)
+    channels *= node.groups
     pads = node.attributes.get("pads", [0, 0, 0, 0])
     is_large = rows * columns > LARGE_POSITIONS
     is_whole_map = min(pads) == 0 and max(rows, columns) > LONGEST_SIDE
@@ -102,8 +102,8 @@ def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
     step = -(-rows // (MOST_POSITIONS // columns))
     dilations = node.attributes.get("dilations", [1, 1])
     name = node.proto.name or node.result
-    nodes: list[Node] = []
-    parts: list[str] = []
+    nodes = []
+    parts = []
     # 3.
     for first in range(step):
         kernel = weight[:, :, first::step]

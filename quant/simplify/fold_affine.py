@@ -104,7 +104,7 @@ def fold_in_front(graph: OnnxGraph, shapes: Shapes) -> None:
         graph: the graph, which is changed in place.
         shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
     """
-    folded = set[Node]()
+    folded = set()
     for node in graph.nodes[::-1]:
         result = node.result
         match = affine_of(graph, node)
@@ -262,7 +262,7 @@ def _width(graph: OnnxGraph, node: Node) -> int:
     """Return the channels that a convolution writes."""
     shape = graph.constants[node.inputs[1]].shape
     # A transposed convolution has weights (I, O / groups, kh, kw).
-    groups = node.attributes.get("group", 1)
+    groups = node.groups
     return int(shape[0] if node.op_type == "Conv" else shape[1] * groups)
 
 
@@ -273,7 +273,7 @@ def _fold(graph: OnnxGraph, node: Node, affine: Affine, into_results: bool) -> N
     weight = graph.constants[node.inputs[1]].astype(np.float64)
     stated_bias = _float64(graph, node, 2)
     bias = np.zeros(_width(graph, node)) if stated_bias is None else stated_bias
-    groups = node.attributes.get("group", 1)
+    groups = node.groups
     split = weight.reshape(groups, -1, *weight.shape[1:])
     # A convolution has its weights as (O, I / groups, kh, kw), a transposed one as
     # (I, O / groups, kh, kw): the channels in question stand along the first axis of a group, or

@@ -267,7 +267,7 @@ def _with_written_maps(graph: OnnxGraph, node: Node) -> list[Node] | None:
     )
     if not maps or not is_map or source in maps:
         return None
-    nodes: list[Node] = []
+    nodes = []
     names = {}
     for number, (name, value) in enumerate(maps.items()):
         names[name] = f"{node.result}.constant_{number}"

@@ -62,9 +62,7 @@ def unshuffle_slices(graph: OnnxGraph, node: Node) -> list[Node] | None:
     size = graph.shapes.get(source, ())
     readers = graph.readers[node.result]
     takes_order = all(
-        reader.op_type == "Conv"
-        and is_convolution(graph, reader)
-        and reader.attributes.get("group", 1) == 1
+        reader.op_type == "Conv" and is_convolution(graph, reader) and reader.groups == 1
         for reader in readers
     )
     is_read = readers and node.result not in graph.outputs
