@@ -17,7 +17,12 @@ from beers_deploy.quant.graph import (
     Pointwise,
     Shuffle,
 )
-from beers_deploy.quant.integer.arithmetic import activated, activation_table, mean_factor
+from beers_deploy.quant.integer.arithmetic import (
+    activated,
+    activation_table,
+    mean_factor,
+    saturated,
+)
 from beers_deploy.quant.integer.reference import layer_sums, rounded
 
 Range = tuple[np.ndarray, np.ndarray]
@@ -69,7 +74,7 @@ def layer_bounds(core: IntCore) -> list[LayerBound]:
         low, high, shift = _accumulated(core, op, ranges)
         bits = float(np.log2(max(int(np.abs(low).max()), int(np.abs(high).max()), 1)))
         low, high = (rounded(end, shift, half_even=False)[0] for end in (low, high))
-        ranges[op.output] = np.clip(low, INT8_MIN, INT8_MAX), np.clip(high, INT8_MIN, INT8_MAX)
+        ranges[op.output] = saturated(low), saturated(high)
         bounds.append(LayerBound(op.name, bits, int(low.min()), int(high.max())))
     return bounds
 

@@ -15,16 +15,17 @@ from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN, best_frac_bits, quantize
 from beers_deploy.quant.graph import (
     PLANES,
+    SIX,
     Activation,
     Add,
     Conv,
     Graph,
     Mul,
+    OneInput,
     Op,
     Window,
     ties_scales,
 )
-from beers_deploy.quant.graph.operations import SIX, OneInput
 from beers_deploy.quant.host_part import ONE_CHANNEL, HostPart
 
 

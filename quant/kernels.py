@@ -155,17 +155,16 @@ def _move_relu_down(largest: dict[str, int], graph: OnnxGraph, node: Node) -> li
         return None
     result = node.result
     writer = graph.sole_writer(node.source)
-    if writer is None or writer.op_type not in REQUANTISING:
+    if writer is None or writer.op_type not in REQUANTISING or result in graph.outputs:
         return None
     readers = graph.readers[result]
-    is_moved = _holds(graph, writer, RESULT_ZERO, middle) and result not in graph.outputs
-    is_moved = is_moved and all(
+    all_hold = _holds(graph, writer, RESULT_ZERO, middle) and all(
         reader.op_type in OPERATORS
         and reader.inputs.count(result) == 1
         and _holds(graph, reader, ZERO, middle)
         for reader in readers
     )
-    if not is_moved:
+    if not all_hold:
         return None
     # With a zero point of 0 the writer clips at 0 itself, which is the ReLU. What remains is the
     # upper end: 255 around the old zero point is 255 - middle around 0.

@@ -210,7 +210,7 @@ def _equalized(
     Returns:
         The graph, and the crops on which errors were compared.
     """
-    first_crop, *others = crops(images[0], 0 if halo_of(graph) is not None else None)
+    first_crop, *others = crops(images[0], halo_of(graph))
     count = crop_count(first_crop, len(images) * (1 + len(others)))
     work = work_of(graph, plan.host_part, first_crop)
     limit = bound(plan.stages(), graph, work, count, plan.effort)

@@ -146,7 +146,7 @@ def layer_errors(
     )
     names = tensors((*graph, *twins))
     width = core.host_part.planes
-    halo_px = None if halo_of(graph) is None else 0
+
     float_session = open_session(graph_to_onnx((*graph, *twins), names, width))
     int8_session = open_session(host_model(core, {}))
     rests = {
@@ -159,7 +159,7 @@ def layer_errors(
     scale = core.scale(CORRECTION)
     ranges = core.host_part.input_ranges
     for crop in crops:
-        (values,) = tensor_values(float_session, names, crop, halo_px, core.host_part)
+        (values,) = tensor_values(float_session, names, crop, halo_of(graph), core.host_part)
         float_values = dict(zip(names, values, strict=True))
         restored = core.host_part.restore(crop, float_values[CORRECTION], scale)
         restored = to_shares(restored, ranges)

@@ -30,8 +30,9 @@ from beers_deploy.quant.integer.arithmetic import (
     bilinear_weights,
     bound_of,
     mean_factor,
+    saturated,
 )
-from beers_deploy.quant.integer.reference import rounded, saturated
+from beers_deploy.quant.integer.reference import rounded
 from beers_deploy.quant.untrusted import times
 
 SUM_BITS = 30

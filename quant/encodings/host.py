@@ -30,6 +30,7 @@ from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
 from beers_deploy.quant.graph import (
     CORRECTION,
     IMAGE,
+    LEAKY_SLOPE,
     PLANES,
     Activation,
     Add,
@@ -44,7 +45,6 @@ from beers_deploy.quant.graph import (
     channels_of,
 )
 from beers_deploy.quant.graph.base import THE_IMAGE
-from beers_deploy.quant.graph.operations import LEAKY_SLOPE
 from beers_deploy.quant.graph.writer import window_attributes, write_float, write_shuffle
 from beers_deploy.quant.host_part import ZERO, HostWriter
 from beers_deploy.quant.integer.arithmetic import (

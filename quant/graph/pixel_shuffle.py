@@ -86,16 +86,16 @@ def _shuffle(chain: list[Node], sizes: tuple[int, ...], graph: OnnxGraph) -> Nod
             continue
         up = growth > 1
         block = max(growth.numerator, growth.denominator)
-        mode = ""
-        for order, columns_first in ORDERS.items():
-            shuffle = Shuffle("", "", "", block, up, columns_first)
-            if block > 1 and not mode and np.array_equal(shuffle(image), result):
-                mode = order
+        modes = [
+            mode
+            for mode, columns_first in ORDERS.items()
+            if np.array_equal(Shuffle("", "", "", block, up, columns_first)(image), result)
+        ]
         kind = "DepthToSpace" if up else "SpaceToDepth"
         # Messages name the first node of the chain, and files that we write the last one.
         last = chain[-1]
         node = Node.new(kind, chain[0].inputs[:1], last.result, last.name, blocksize=block)
-        attributes = {"blocksize": block, "mode": mode}
+        attributes = {"blocksize": block, "mode": modes[0] if modes and block > 1 else ""}
         return replace(node, name=chain[0].name, attributes=attributes)
     return None
 

@@ -10,8 +10,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
-from beers_deploy.quant.graph import Activation, AveragePool, MaxPool, Pointwise, Window
-from beers_deploy.quant.graph.operations import SIX
+from beers_deploy.quant.graph import SIX, Activation, AveragePool, MaxPool, Pointwise, Window
 
 FLOAT32_WHOLE_MAX = 2**24
 """float32 represents integers exactly up to this value, and sums them exactly in any order."""
@@ -256,4 +255,9 @@ def activation_table(op: Pointwise, frac_bits: Mapping[str, int]) -> np.ndarray:
     values = op.activation(np.arange(INT8_MIN, INT8_MAX + 1) * 2.0 ** -frac_bits[op.input])
     # The DPU rounds activations half up, where np.rint would round half to even.
     units = np.floor(values * 2.0 ** frac_bits[op.output] + 0.5)
-    return np.asarray(np.clip(units, INT8_MIN, INT8_MAX), np.int16)
+    return saturated(units)
+
+
+def saturated(values: np.ndarray) -> np.ndarray:
+    """Clip integers to the range of int8, and return them as int16."""
+    return np.asarray(np.clip(values, INT8_MIN, INT8_MAX), np.int16)

@@ -38,6 +38,7 @@ from beers_deploy.quant.integer.arithmetic import (
     convolve,
     enlarged,
     means,
+    saturated,
     window_maxima,
 )
 
@@ -274,8 +275,3 @@ def rounded(sums: np.ndarray, shift: int, half_even: bool) -> tuple[np.ndarray, 
         # Half up has raised every tie; the odd ones go back to the even number below.
         quotients = quotients - (ties & (quotients % 2 == 1))
     return np.asarray(quotients), float(ties.mean())
-
-
-def saturated(values: np.ndarray) -> np.ndarray:
-    """Clip integers to the range of int8, and return them as int16."""
-    return np.asarray(np.clip(values, INT8_MIN, INT8_MAX), np.int16)

@@ -26,6 +26,7 @@ from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
 from beers_deploy.quant.graph import (
     CORRECTION,
+    LEAKY_SLOPE,
     PLANES,
     Activation,
     Add,
@@ -38,7 +39,6 @@ from beers_deploy.quant.graph import (
     Shuffle,
     Window,
 )
-from beers_deploy.quant.graph.operations import LEAKY_SLOPE
 from beers_deploy.quant.host_part import HostPart, OutputDecoding
 from beers_deploy.quant.integer.arithmetic import (
     activation_table,

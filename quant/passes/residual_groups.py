@@ -19,6 +19,7 @@ from beers_deploy.quant.frac_bits import INT8_MAX
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
+    SIX,
     Activation,
     Add,
     AveragePool,
@@ -31,7 +32,6 @@ from beers_deploy.quant.graph import (
     Resize,
     channels_of,
 )
-from beers_deploy.quant.graph.operations import SIX
 from beers_deploy.quant.graph.ties import united
 
 GROUP_FRAC_BITS = 8

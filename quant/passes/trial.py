@@ -111,7 +111,7 @@ def search_targets(
         The crops with their float results.
     """
     session = open_session(graph_to_onnx(graph, [CORRECTION], host_part.planes))
-    halo_px = 0 if halo_of(graph) is not None else None
+    halo_px = halo_of(graph)
 
     def restored(crop: np.ndarray) -> np.ndarray:
         (correction,) = next(tensor_values(session, [CORRECTION], crop, halo_px, host_part))

@@ -27,7 +27,8 @@ from beers_deploy.network import Network
 from beers_deploy.profiles.errors import BeersError, OptionError
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.graph import PLANES
-from beers_deploy.quant.integer.reference import layer_sums, rounded, saturated
+from beers_deploy.quant.integer.arithmetic import saturated
+from beers_deploy.quant.integer.reference import layer_sums, rounded
 from examples.networks import build, to_onnx
 from tests.deploy.command_line import done, refused
 from tests.quant.quick import one_guess
