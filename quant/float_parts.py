@@ -5,7 +5,7 @@ agree, and the gate would pass a file that no DPU computes. Its metadata is no e
 judged file wrote it.
 """
 
-import onnx
+from onnx import ModelProto
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.figures import Check
@@ -36,7 +36,7 @@ LAYERS = {
 """Operators with weights, and those that contain a graph of their own."""
 
 
-def float_nodes(model: onnx.ModelProto) -> list[Node]:
+def float_nodes(model: ModelProto) -> list[Node]:
     """List the nodes of an INT8 file that compute in float.
 
     All nodes count except those that compute on integers, and those that only define how integers
@@ -51,7 +51,7 @@ def float_nodes(model: onnx.ModelProto) -> list[Node]:
     ]
 
 
-def float_layers_check(model: onnx.ModelProto) -> Check:
+def float_layers_check(model: ModelProto) -> Check:
     """Return the check that an INT8 file computes no layer in float.
 
     The check's value is the number of float nodes that have weights or contain a graph of their
@@ -61,7 +61,7 @@ def float_layers_check(model: onnx.ModelProto) -> Check:
     return Check("layers computed in float", len(layers), 0, "layer", detail=", ".join(layers[:3]))
 
 
-def float_note(model: onnx.ModelProto) -> list[str]:
+def float_note(model: ModelProto) -> list[str]:
     """Return a note for the user that names the operators which another quantiser's file computes
     in float.
 

@@ -24,8 +24,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-import onnx
-from onnx import TensorProto
+from onnx import ModelProto, TensorProto
 
 from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.domains import opset_of
@@ -76,7 +75,7 @@ RESULT_ZERO = 7
 """The input of these that holds the zero point of the result."""
 
 
-def with_exact_sums(model: onnx.ModelProto) -> onnx.ModelProto:
+def with_exact_sums(model: ModelProto) -> ModelProto:
     """Return an INT8 model that computes the same integers on a processor whose int8 kernels
     saturate.
 
@@ -279,7 +278,7 @@ FIRST_OPSET = 11
 """The first opset in which Pad and Slice have their positions as inputs."""
 
 
-def with_wide_convolutions(model: onnx.ModelProto) -> onnx.ModelProto:
+def with_wide_convolutions(model: ModelProto) -> ModelProto:
     """Return the model with channels of zeros added to integer convolutions that have few channels.
 
     onnxruntime computes these faster with more channels (FEWEST_OUTPUTS). The results are the same.

@@ -14,7 +14,15 @@ from pathlib import Path
 import numpy as np
 import onnx
 from google.protobuf.message import DecodeError
-from onnx import numpy_helper
+from onnx import (
+    GraphProto,
+    ModelProto,
+    NodeProto,
+    TensorProto,
+    ValueInfoProto,
+    helper,
+    numpy_helper,
+)
 
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.formats import HEAD_BYTES, other_format
@@ -41,7 +49,7 @@ REMEDY = (
 )
 
 
-def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
+def load_onnx(path: Path, to_run: bool = True) -> ModelProto:
     """Read an ONNX model with its external weights; every file is read by this function.
 
     A float network is simplified (`quant.simplify`), and an INT8 network is returned unchanged. If
@@ -70,7 +78,7 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
     return _simplified(parse_onnx(content, str(path), to_run, path), str(path), to_run)
 
 
-def read_onnx(content: bytes, where: str) -> onnx.ModelProto:
+def read_onnx(content: bytes, where: str) -> ModelProto:
     """Read a network from bytes, with the checks and the simplification of `load_onnx`.
 
     Args:
@@ -83,7 +91,7 @@ def read_onnx(content: bytes, where: str) -> onnx.ModelProto:
     return _simplified(parse_onnx(content, where), where, True)
 
 
-def _simplified(model: onnx.ModelProto, where: str, to_run: bool) -> onnx.ModelProto:
+def _simplified(model: ModelProto, where: str, to_run: bool) -> ModelProto:
     try:
         # First, because folding removes the Dropout and BatchNormalization that show the mode.
         require_inference(model, where)
@@ -99,7 +107,7 @@ def _simplified(model: onnx.ModelProto, where: str, to_run: bool) -> onnx.ModelP
 
 def parse_onnx(
     content: bytes, where: str, to_run: bool = True, path: Path | None = None
-) -> onnx.ModelProto:
+) -> ModelProto:
     """Parse and check a model from bytes as `load_onnx` does, without simplifying it.
 
     Args:
@@ -117,7 +125,7 @@ def parse_onnx(
     if other := other_format(content[:HEAD_BYTES]):
         raise ModelError(f"{where} is not an ONNX file, but {other.name}: {other.remedy}.")
     try:
-        model = onnx.ModelProto()
+        model = ModelProto()
         model.ParseFromString(content)
         if path is not None:
             take_in(model, path)
@@ -153,7 +161,7 @@ def require_onnx_name(*paths: Path | None) -> None:
             raise OptionError(f"The name of the output must end in .onnx, got {path}.")
 
 
-def save_onnx(model: onnx.ModelProto, path: Path) -> None:
+def save_onnx(model: ModelProto, path: Path) -> None:
     """Check a model, and write it to a file completely or not at all.
 
     Args:
@@ -165,14 +173,12 @@ def save_onnx(model: onnx.ModelProto, path: Path) -> None:
         onnx.save_model(model, temporary)
 
 
-def metadata(model: onnx.ModelProto) -> dict[str, str]:
+def metadata(model: ModelProto) -> dict[str, str]:
     """Return the metadata that a model's file states, as text by key."""
     return {item.key: item.value for item in model.metadata_props}
 
 
-def make_model(
-    graph: onnx.GraphProto, about: dict[str, str], microsoft: bool = False
-) -> onnx.ModelProto:
+def make_model(graph: GraphProto, about: dict[str, str], microsoft: bool = False) -> ModelProto:
     """Build a model around a graph, with the ONNX versions that this project writes.
 
     Args:
@@ -180,12 +186,12 @@ def make_model(
         about: the metadata of the model, by key.
         microsoft: True to import onnxruntime's own operators (the domain com.microsoft) as well.
     """
-    opsets = [onnx.helper.make_opsetid("", OPSET)]
-    opsets += [onnx.helper.make_opsetid(MICROSOFT, 1)] if microsoft else []
-    model = onnx.helper.make_model(
+    opsets = [helper.make_opsetid("", OPSET)]
+    opsets += [helper.make_opsetid(MICROSOFT, 1)] if microsoft else []
+    model = helper.make_model(
         graph, opset_imports=opsets, ir_version=IR_VERSION, producer_name="beers-deploy"
     )
-    onnx.helper.set_model_props(model, about)
+    helper.set_model_props(model, about)
     return model
 
 
@@ -200,8 +206,8 @@ class GraphWriter:
     """The domain of operators that state none; the empty one is ONNX's own, stated explicitly."""
 
     def __init__(self) -> None:
-        self.nodes: list[onnx.NodeProto] = []
-        self.weights: dict[str, onnx.TensorProto] = {}
+        self.nodes: list[NodeProto] = []
+        self.weights: dict[str, TensorProto] = {}
 
     def node(
         self,
@@ -222,11 +228,11 @@ class GraphWriter:
             domain: the domain of the operator; None for the domain of the writer.
             attributes: the attributes of the node.
         """
-        node = onnx.helper.make_node(
+        node = helper.make_node(
             kind, inputs, [output], name=name or output, domain=domain or self.domain
         )
         node.attribute.extend(
-            onnx.helper.make_attribute(key, value) for key, value in attributes.items()
+            helper.make_attribute(key, value) for key, value in attributes.items()
         )
         self.nodes.append(node)
         return output
@@ -241,8 +247,8 @@ class GraphWriter:
         return self.constant(f"scale_2^{-frac_bits}", np.array(2.0**-frac_bits, np.float32))
 
     def graph(
-        self, name: str, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
-    ) -> onnx.GraphProto:
+        self, name: str, inputs: list[ValueInfoProto], outputs: list[ValueInfoProto]
+    ) -> GraphProto:
         """Build the ONNX graph of the nodes and constants collected so far.
 
         Args:
@@ -250,16 +256,14 @@ class GraphWriter:
             inputs: type and shape of each input, such as `image_info` describes them.
             outputs: type and shape of each output.
         """
-        return onnx.helper.make_graph(
-            self.nodes, name, inputs, outputs, list(self.weights.values())
-        )
+        return helper.make_graph(self.nodes, name, inputs, outputs, list(self.weights.values()))
 
 
 OUTPUT = "output"
 """The metadata key of the name of the output, in a network with only one of its outputs."""
 
 
-def with_one_output(model: onnx.ModelProto, name: str, where: str) -> onnx.ModelProto:
+def with_one_output(model: ModelProto, name: str, where: str) -> ModelProto:
     """Return a network that has only one of its outputs, and only the nodes that compute it.
 
     Args:
@@ -289,11 +293,11 @@ def with_one_output(model: onnx.ModelProto, name: str, where: str) -> onnx.Model
         needed = [part for part in parts if part.name in reads]
         del parts[:]
         parts.extend(needed)
-    onnx.helper.set_model_props(copy, {**metadata(copy), OUTPUT: name})
+    helper.set_model_props(copy, {**metadata(copy), OUTPUT: name})
     return _simplified(copy, where, to_run=False)
 
 
-def is_quantized(model: onnx.ModelProto) -> bool:
+def is_quantized(model: ModelProto) -> bool:
     """Return True if a network is an INT8 one: any node reads, writes or computes with quantised
     numbers.
     """
@@ -321,7 +325,7 @@ def faults_named(label: str) -> Iterator[None]:
         raise ModelError(f"{label}: {error}") from error
 
 
-def require_quantized(model: onnx.ModelProto, name: str, expected: bool) -> None:
+def require_quantized(model: ModelProto, name: str, expected: bool) -> None:
     """Raise ModelError unless a network is of the expected kind, float or INT8.
 
     This detects that a user gave the float and the INT8 file in the wrong order.

@@ -22,8 +22,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
-import onnx
-from onnx import helper, numpy_helper
+from onnx import ModelProto, helper, numpy_helper
 
 from beers_deploy.model.metrics.fidelity import psnr_db
 from beers_deploy.profiles.figures import Figure, Row, measured
@@ -318,7 +317,7 @@ def grid_of(low: float, high: float, zero_point: bool, powers: bool) -> Grid:
     return Grid(scale, -end - 1, end)
 
 
-def rounded_model(model: onnx.ModelProto, grids: Mapping[str, Grid]) -> onnx.ModelProto:
+def rounded_model(model: ModelProto, grids: Mapping[str, Grid]) -> ModelProto:
     """Round tensors of a float model to their grids, half up as a DPU does.
 
     Args:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import onnx
+from onnx import ModelProto
 
 from beers_deploy.model.levels import INTERVAL
 from beers_deploy.quant.core import SHIFTS, IntCore, Shifts
@@ -59,14 +59,14 @@ class Quantized:
         network: the float network before any pass, split into DPU and host part.
     """
 
-    host: onnx.ModelProto
+    host: ModelProto
     core: IntCore
     graph: Graph
     network: SplitNetwork
 
 
 def quantize_model(
-    model: onnx.ModelProto,
+    model: ModelProto,
     patches: Patches,
     about: dict[str, str],
     shifts: Shifts = SHIFTS,

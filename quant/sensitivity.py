@@ -10,7 +10,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import onnx
 from onnx import TensorProto, helper
 
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
@@ -149,11 +148,15 @@ def layer_errors(
 
     float_session = open_session(graph_to_onnx((*graph, *twins), names, width))
     int8_session = open_session(host_model(core, {}))
-    rests = {
-        name: open_session(_rest(graph, name, width))
-        for name in tensors(graph)
-        if name != CORRECTION
-    }
+    # The float network from each of its tensors on, an input next to the planes.
+    rests = {}
+    for name in set(tensors(graph)) - {CORRECTION}:
+        behind = tuple(op for op in graph if op.output != name)
+        model = graph_to_onnx(behind, [CORRECTION], width)
+        model.graph.input.append(
+            helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", "C", None, None])
+        )
+        rests[name] = open_session(model)
     layers = [LayerError(op.name, Loss(), Loss()) for op in graph]
     together = Loss()
     scale = core.scale(CORRECTION)
@@ -185,15 +188,6 @@ def layer_errors(
             layer.network.add(to_shares(image, ranges), restored, offset)
         together.add(to_shares(result_of(int8_session, crop), ranges), restored, offset)
     return layers, together
-
-
-def _rest(graph: Graph, tensor: str, width: int) -> onnx.ModelProto:
-    """Return the float network from one of its tensors, an input next to the planes, on."""
-    model = graph_to_onnx(tuple(op for op in graph if op.output != tensor), [CORRECTION], width)
-    model.graph.input.append(
-        helper.make_tensor_value_info(tensor, TensorProto.FLOAT, ["N", "C", None, None])
-    )
-    return model
 
 
 def _in_int8(op: Op, core: IntCore, exact: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -10,8 +10,8 @@ from itertools import islice, pairwise, product
 from pathlib import Path
 
 import numpy as np
-import onnx
 import onnxruntime as ort
+from onnx import ModelProto, helper
 
 from beers_deploy.model.processor import int8_adds_exactly
 from beers_deploy.profiles.errors import CODE_FAULTS, ModelError, printable, reason_of
@@ -35,7 +35,7 @@ from beers_deploy.quant.untrusted import contradictions, times
 
 
 def open_session(
-    model: Path | onnx.ModelProto,
+    model: Path | ModelProto,
     threads: int = 0,
     optimise: bool = True,
     exact: bool | None = None,
@@ -66,8 +66,8 @@ def open_session(
     options.add_session_config_entry("session.force_spinning_stop", "1")
     if not optimise:
         options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
-    network = model if isinstance(model, onnx.ModelProto) else load_onnx(model)
-    name = "the network" if isinstance(model, onnx.ModelProto) else str(model)
+    network = model if isinstance(model, ModelProto) else load_onnx(model)
+    name = "the network" if isinstance(model, ModelProto) else str(model)
     # Outside `contradictions`: the processor is asked with a network of its own, whose faults are
     # not this file's.
     if exact is None:
@@ -90,7 +90,7 @@ def open_session(
         ) from error
 
 
-def open_any_size(model: onnx.ModelProto, optimise: bool = True) -> ort.InferenceSession:
+def open_any_size(model: ModelProto, optimise: bool = True) -> ort.InferenceSession:
     """Open a session that accepts images of any size, even if the file is fixed to one tile.
 
     Args:
@@ -307,7 +307,7 @@ def _places(
 LAYER_PATCHES = 4
 
 
-def few_crops(images: Iterable[np.ndarray], model: onnx.ModelProto) -> list[np.ndarray]:
+def few_crops(images: Iterable[np.ndarray], model: ModelProto) -> list[np.ndarray]:
     """Return one crop of each of the first LAYER_PATCHES images, on which figures of each layer are
     measured.
 
@@ -322,7 +322,7 @@ def few_crops(images: Iterable[np.ndarray], model: onnx.ModelProto) -> list[np.n
     return [crops(image, halo_px)[0] for image in islice(images, LAYER_PATCHES)]
 
 
-def with_outputs(model: onnx.ModelProto, kinds: Mapping[str, int]) -> onnx.ModelProto:
+def with_outputs(model: ModelProto, kinds: Mapping[str, int]) -> ModelProto:
     """Return a copy of a model that also returns some of its inner tensors.
 
     Args:
@@ -332,7 +332,7 @@ def with_outputs(model: onnx.ModelProto, kinds: Mapping[str, int]) -> onnx.Model
     extended = deepcopy(model)
     names = {value.name for value in extended.graph.output}
     extended.graph.output.extend(
-        onnx.helper.make_tensor_value_info(name, kind, None)
+        helper.make_tensor_value_info(name, kind, None)
         for name, kind in kinds.items()
         if name not in names
     )

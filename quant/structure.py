@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from itertools import chain
 
 import numpy as np
-import onnx
+from onnx import ModelProto, helper
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.figures import Check
@@ -91,7 +91,7 @@ class Rounded:
         return np.asarray(high | low)
 
 
-def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> dict[str, float]:
+def saturated_shares(model: ModelProto, images: Iterable[np.ndarray]) -> dict[str, float]:
     """Return for each 8-bit tensor the share of values that may have been clipped, over all images.
 
     These are the values at the largest or smallest integer, as `Rounded.may_be_clipped` counts
@@ -114,8 +114,7 @@ def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> di
     if not tensors:
         return {}
     kinds = {
-        t.name: onnx.helper.np_dtype_to_tensor_dtype(np.dtype(t.scale.integer_type))
-        for t in tensors
+        t.name: helper.np_dtype_to_tensor_dtype(np.dtype(t.scale.integer_type)) for t in tensors
     }
     session = open_session(with_outputs(any_size(model), kinds), optimise=False)
     ends = np.zeros(len(tensors))
@@ -131,7 +130,7 @@ def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> di
     return {tensor.name: float(share) for tensor, share in zip(tensors, shares, strict=True)}
 
 
-def rounded_tensors(model: onnx.ModelProto) -> list[Rounded]:
+def rounded_tensors(model: ModelProto) -> list[Rounded]:
     """List the tensors that the nodes of an INT8 file round to 8 bits, in the order of the nodes.
 
     Constants, such as quantised weights, are left out.
@@ -146,7 +145,7 @@ def rounded_tensors(model: onnx.ModelProto) -> list[Rounded]:
         return _rounded(OnnxGraph(model), _own_core(model))
 
 
-def _own_core(model: onnx.ModelProto) -> IntCore | None:
+def _own_core(model: ModelProto) -> IntCore | None:
     """Return the integer core that a file describes; None if it describes none."""
     try:
         return read_core(model)
@@ -217,7 +216,7 @@ class Relus:
         )
 
 
-def count_relus(model: onnx.ModelProto) -> Relus:
+def count_relus(model: ModelProto) -> Relus:
     """Count the ReLUs of a network, so that a file that lost one can be detected.
 
     In an INT8 file a convolution whose 8 bits begin at zero may be a ReLU. These are counted
@@ -281,7 +280,7 @@ def _is_relu(node: Node, graph: OnnxGraph, tensors: dict[str, Rounded]) -> bool:
 
 
 def structure_checks(
-    float_model: onnx.ModelProto, int8: onnx.ModelProto, must_describe: bool = False
+    float_model: ModelProto, int8: ModelProto, must_describe: bool = False
 ) -> list[Check]:
     """Check that an INT8 file has the ReLUs of its float network, is encoded correctly, and does
     not depend on onnxruntime's optimisations.

@@ -10,8 +10,7 @@ from itertools import chain
 from types import ModuleType
 
 import numpy as np
-import onnx
-from onnx import TensorProto, helper, numpy_helper
+from onnx import GraphProto, ModelProto, TensorProto, helper, numpy_helper
 
 from beers_deploy.profiles.errors import BeersError, ModelError, printable, reason_of
 
@@ -44,7 +43,7 @@ VALUE_BYTES: dict[int, int] = {
 """The number of bytes per value of each plain number type."""
 
 
-def check_content(model: onnx.ModelProto, where: str) -> None:
+def check_content(model: ModelProto, where: str) -> None:
     """Raise ModelError if a model does not hold what it states.
 
     It checks that names are text, that there are an input and an output, that no stated size is
@@ -122,7 +121,7 @@ def times(sizes: Iterable[float]) -> str:
     return " x ".join(f"{size:.12g}" for size in sizes)
 
 
-def held_tensors(graph: onnx.GraphProto) -> Iterator[TensorProto]:
+def held_tensors(graph: GraphProto) -> Iterator[TensorProto]:
     """Yield every constant tensor of a graph: initializers and attributes of nodes, nested graphs
     included.
 

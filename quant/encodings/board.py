@@ -13,8 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import onnx
-from onnx import shape_inference
+from onnx import ModelProto, shape_inference
 
 from beers_deploy.model.io.files import write_text
 from beers_deploy.profiles.errors import OptionError
@@ -30,9 +29,7 @@ from beers_deploy.quant.onnx_file import GraphWriter, make_model, metadata
 from beers_deploy.quant.untrusted import contradictions
 
 
-def board_model(
-    core: IntCore, about: dict[str, str], tile_px: int | None = None
-) -> onnx.ModelProto:
+def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None) -> ModelProto:
     """Write a core alone as an ONNX model with QuantizeLinear and DequantizeLinear (QDQ), which
     board flows read.
 
@@ -67,7 +64,7 @@ TEXTS = {
 
 def _core_file(
     writer: GraphWriter, host_part: HostPart, about: dict[str, str], tile_px: int | None
-) -> onnx.ModelProto:
+) -> ModelProto:
     read_px = tile_px and (tile_px + 2 * host_part.border_px) // host_part.place_px
     size = image_info(PLANES, host_part.planes, read_px)
     written = host_part.decoding.copies * host_part.outputs
@@ -88,7 +85,7 @@ def _core_file(
     return make_model(writer.graph(CORE_NAME, [size], [result]), entries | places)
 
 
-def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:
+def as_on_board(model: ModelProto) -> ModelProto:
     """Return an INT8 file that was written for onnxruntime in the board's encoding of the same
     integers.
 
@@ -169,7 +166,7 @@ CONFIG = "vitisai_config.json"
 CLAMPS = (Activation.relu, Activation.relu6)
 
 
-def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> onnx.ModelProto:
+def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> ModelProto:
     """Write a core as VINT8, the INT8 file that AMD's current flow for its NPU compiles.
 
     It has the integers of the board's file in another layout, for an image of one size, with every

@@ -9,8 +9,7 @@ Others may be added to a file, such as the calibration of an interval.
 
 import hashlib
 
-import onnx
-from onnx import numpy_helper
+from onnx import ModelProto, helper, numpy_helper
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.encodings.description import KEY, SENSOR_BIASES
@@ -20,7 +19,7 @@ CHECKSUM = "checksum"
 """The metadata key of the checksum, in hexadecimal."""
 
 
-def checksum(model: onnx.ModelProto) -> str:
+def checksum(model: ModelProto) -> str:
     """Compute the SHA-256 of all that determines the integers of an INT8 file, in hexadecimal.
 
     Args:
@@ -39,7 +38,7 @@ def checksum(model: onnx.ModelProto) -> str:
     return digest.hexdigest()
 
 
-def with_damage_of(source: onnx.ModelProto, model: onnx.ModelProto) -> onnx.ModelProto:
+def with_damage_of(source: ModelProto, model: ModelProto) -> ModelProto:
     """Return a model that was computed from an INT8 file, damaged if that file is.
 
     Otherwise its new checksum would cover the damage.
@@ -50,11 +49,11 @@ def with_damage_of(source: onnx.ModelProto, model: onnx.ModelProto) -> onnx.Mode
     """
     if is_damaged(source):
         about = {**metadata(model), CHECKSUM: metadata(source)[CHECKSUM]}
-        onnx.helper.set_model_props(model, about)
+        helper.set_model_props(model, about)
     return model
 
 
-def is_damaged(model: onnx.ModelProto) -> bool:
+def is_damaged(model: ModelProto) -> bool:
     """Return True if an INT8 file states a checksum that is not that of its integers.
 
     A float file, and one that another program wrote, states none.
@@ -66,7 +65,7 @@ def is_damaged(model: onnx.ModelProto) -> bool:
     return stated is not None and stated != checksum(model)
 
 
-def require_undamaged(model: onnx.ModelProto, name: str) -> None:
+def require_undamaged(model: ModelProto, name: str) -> None:
     """Raise ModelError if an INT8 file was changed after it was written.
 
     Args:

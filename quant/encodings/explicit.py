@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from importlib.metadata import version
 
 import onnx
-from onnx import helper, shape_inference
+from onnx import AttributeProto, ModelProto, NodeProto, helper, shape_inference
 
 from beers_deploy.profiles.errors import OptionError, reason_of
 from beers_deploy.quant.domains import opset_of
@@ -33,7 +33,7 @@ OPERATORS = frozenset(
 """ONNX's operators in the profile's first list (REQ-OP-000)."""
 
 
-def made_explicit(model: onnx.ModelProto, texts: dict[str, str]) -> onnx.ModelProto:
+def made_explicit(model: ModelProto, texts: dict[str, str]) -> ModelProto:
     """Return a model that computes the same and leaves nothing to defaults: attributes, shapes and
     producer are stated.
 
@@ -64,7 +64,7 @@ def made_explicit(model: onnx.ModelProto, texts: dict[str, str]) -> onnx.ModelPr
         ) from error
 
 
-def implicit_parts(model: onnx.ModelProto) -> dict[str, list[str]]:
+def implicit_parts(model: ModelProto) -> dict[str, list[str]]:
     """List the parts of a model that the safety-related profile of ONNX does not allow to be
     implicit.
 
@@ -104,7 +104,7 @@ def implicit_parts(model: onnx.ModelProto) -> dict[str, list[str]]:
     }
 
 
-def _defaults(node: onnx.NodeProto, opset: int) -> Iterator[onnx.AttributeProto]:
+def _defaults(node: NodeProto, opset: int) -> Iterator[AttributeProto]:
     """Yield the attributes that a node leaves to their defaults.
 
     Args:

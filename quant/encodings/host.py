@@ -18,8 +18,7 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
-import onnx
-from onnx import TensorProto
+from onnx import ModelProto, TensorProto, helper
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.core import IntConv, IntCore
@@ -62,7 +61,7 @@ LEGAL = "int8 legal"
 """The precision in the metadata of a file that `quantize` wrote."""
 
 
-def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
+def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None) -> ModelProto:
     """Write the whole INT8 network as ONNX for stock onnxruntime: from the image to the restored
     image.
 
@@ -86,16 +85,16 @@ def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None)
     if not host_part.adds_image or host_part.last or host_part.base != THE_IMAGE:
         shuffles = (*host_part.back, *host_part.last)
         channels = host_part.outputs // math.prod(shuffle.block**2 for shuffle in shuffles)
-        result = onnx.helper.make_tensor_value_info(
+        result = helper.make_tensor_value_info(
             "restored", TensorProto.FLOAT, ["N", channels, "rows", "columns"]
         )
     graph = writer.graph("convbeers-int8", [image], [result])
     model = make_model(graph, {**about, KEY: describe(core)}, microsoft=True)
-    onnx.helper.set_model_props(model, {**metadata(model), CHECKSUM: checksum(model)})
+    helper.set_model_props(model, {**metadata(model), CHECKSUM: checksum(model)})
     return model
 
 
-def part_model(core: IntCore, start: int, stop: int) -> onnx.ModelProto:
+def part_model(core: IntCore, start: int, stop: int) -> ModelProto:
     """Write a part of a core as an ONNX model for onnxruntime, without the host's part.
 
     Its inputs are the tensors that the part reads from in front of it, and its outputs those of its
@@ -114,7 +113,7 @@ def part_model(core: IntCore, start: int, stop: int) -> onnx.ModelProto:
     reads = dict.fromkeys(chain.from_iterable(op.inputs for op in part))
     ends = [
         [
-            onnx.helper.make_tensor_value_info(name, TensorProto.UINT8, ["N", None, None, None])
+            helper.make_tensor_value_info(name, TensorProto.UINT8, ["N", None, None, None])
             for name in names
         ]
         for names in (
@@ -344,7 +343,7 @@ _WRITERS: dict[type, Callable[..., Any]] = {
 }
 
 
-def read_core(model: onnx.ModelProto) -> IntCore:
+def read_core(model: ModelProto) -> IntCore:
     """Read the integer core of an INT8 file that `quantize` wrote for the host.
 
     Raises:
@@ -359,7 +358,7 @@ def read_core(model: onnx.ModelProto) -> IntCore:
     )
 
 
-def encoding_faults(model: onnx.ModelProto) -> list[str] | None:
+def encoding_faults(model: ModelProto) -> list[str] | None:
     """List where an INT8 file differs from the integer core that its metadata describe.
 
     The file is written again from the description, and each node and constant must be the same.

@@ -10,8 +10,7 @@ from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
-import onnx
-from onnx import TypeProto
+from onnx import ModelProto, TypeProto
 
 from beers_deploy.quant.graph.operations import Shuffle
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
@@ -36,7 +35,7 @@ VALUES = 1 << 22
 """The largest image of a stated size on which nodes are tested."""
 
 
-def with_shuffles(model: onnx.ModelProto) -> OnnxGraph:
+def with_shuffles(model: ModelProto) -> OnnxGraph:
     """Build the graph of a model, in which each pixel shuffle is one node.
 
     A shuffle that the file writes as Reshape and Transpose becomes DepthToSpace or SpaceToDepth.

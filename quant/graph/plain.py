@@ -2,14 +2,14 @@
 accept.
 """
 
-import onnx
+from onnx import ModelProto
 
 from beers_deploy.quant.graph.operations import IMAGE, Activation, Add, Conv, Graph, same
 from beers_deploy.quant.graph.reader import read_network
 from beers_deploy.quant.graph.split_network import SplitNetwork, unsupported
 
 
-def correction_graph(model: onnx.ModelProto) -> Graph:
+def correction_graph(model: ModelProto) -> Graph:
     """Read a network of ConvBEERS' kind, which adds a correction to an image of one channel.
 
     The correction is computed by same-size convolutions of stride 1, ReLU and adds. It may run at

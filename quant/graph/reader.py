@@ -8,7 +8,7 @@ from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
-import onnx
+from onnx import ModelProto
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph.attention import aligned, shrinking
@@ -87,7 +87,7 @@ REMEDIES = {
 OTHER_REMEDY = "Replace it by one that the DPU computes, or cut the network in front of it."
 
 
-def read_network(model: onnx.ModelProto) -> SplitNetwork:
+def read_network(model: ModelProto) -> SplitNetwork:
     """Read a float ONNX network as the short list of operations, split into host and DPU part.
 
     Args:
@@ -115,7 +115,7 @@ def read_network(model: onnx.ModelProto) -> SplitNetwork:
     return network
 
 
-def refusal(model: onnx.ModelProto) -> str:
+def refusal(model: ModelProto) -> str:
     """Return a sentence for a user on why a float network cannot be quantised; "" if it can."""
     try:
         check_runnable(model, "the float network")
@@ -129,7 +129,7 @@ def refusal(model: onnx.ModelProto) -> str:
 class _Reader:
     """Reads the nodes once, in order."""
 
-    def __init__(self, model: onnx.ModelProto) -> None:
+    def __init__(self, model: ModelProto) -> None:
         self.adaptable: AdaptableError | None = None  # the first
         self.source = with_shuffles(self._with_attention(model))
         self.image, *_ = self.source.inputs
@@ -137,7 +137,7 @@ class _Reader:
         self.border_px = self._take_mirror()
         self.end = host_end(self.source)
 
-    def _with_attention(self, model: onnx.ModelProto) -> onnx.ModelProto:
+    def _with_attention(self, model: ModelProto) -> ModelProto:
         """Return the model with attention as `quant.adapt` replaces it, and note that."""
         network = deepcopy(model)
         graph = OnnxGraph(network)

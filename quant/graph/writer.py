@@ -6,8 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import onnx
-from onnx import TensorProto, helper
+from onnx import ModelProto, TensorProto, helper
 
 from beers_deploy.quant.graph.base import Base
 from beers_deploy.quant.graph.operations import (
@@ -31,7 +30,7 @@ from beers_deploy.quant.onnx.window import Window
 from beers_deploy.quant.onnx_file import GraphWriter, make_model
 
 
-def graph_to_onnx(graph: Graph, outputs: list[str], channels: int = 3) -> onnx.ModelProto:
+def graph_to_onnx(graph: Graph, outputs: list[str], channels: int = 3) -> ModelProto:
     """Write a float graph as an ONNX model that reads the int8 planes that an image is split into.
 
     Its input is the tensor `planes` (N, channels, H, W) float32.

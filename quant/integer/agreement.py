@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-import onnx
+from onnx import ModelProto, TensorProto
 
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted
 from beers_deploy.quant.core import IntCore
@@ -62,7 +62,7 @@ class Agreement:
     even: np.ndarray
 
 
-def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreement:
+def agreement(core: IntCore, host: ModelProto, image: np.ndarray) -> Agreement:
     """Run a core by both rules for ties and in onnxruntime, and compare the results of each
     operation.
 
@@ -72,9 +72,7 @@ def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreem
         image: (N, C, H, W) float32 as the network reads it.
     """
     names = [op.output for op in core.ops]
-    session = open_session(
-        with_outputs(any_size(host), dict.fromkeys(names, onnx.TensorProto.UINT8))
-    )
+    session = open_session(with_outputs(any_size(host), dict.fromkeys(names, TensorProto.UINT8)))
     stored = session.run(names, {session.get_inputs()[0].name: image})
     up, reports = run_core(core, core.host_part.encode(image))
     even, _ = run_core(core, core.host_part.encode(image), half_even=True)
@@ -89,7 +87,7 @@ def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreem
 
 
 def integer_rows(
-    model: onnx.ModelProto, core: IntCore, host: onnx.ModelProto, images: Iterable[np.ndarray]
+    model: ModelProto, core: IntCore, host: ModelProto, images: Iterable[np.ndarray]
 ) -> tuple[Row, ...]:
     """Compare a core with the integer reference on a few crops, as table rows.
 

@@ -11,9 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
-import onnx
 from google.protobuf.message import DecodeError
-from onnx import TensorProto
+from onnx import ModelProto, TensorProto
 
 from beers_deploy.model.io.files import sha256
 from beers_deploy.profiles.errors import ModelError, printable
@@ -21,7 +20,7 @@ from beers_deploy.profiles.toml import read_whole, unreadable
 from beers_deploy.quant.untrusted import FILE_BYTES, VALUE_BYTES, check_size
 
 
-def take_in(model: onnx.ModelProto, path: Path) -> None:
+def take_in(model: ModelProto, path: Path) -> None:
     """Load the weights that a model stores in a separate file into the model itself.
 
     Args:
@@ -46,7 +45,7 @@ def network_sha256(path: Path) -> str:
     digest = sha256(path)
     if path.suffix != ".onnx":
         return digest
-    model = onnx.ModelProto()
+    model = ModelProto()
     try:
         model.ParseFromString(read_whole(path, FILE_BYTES))
     except (DecodeError, OSError, ValueError):

@@ -11,9 +11,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import onnx
 from numpy.typing import DTypeLike
-from onnx import NodeProto, TensorProto, TypeProto, helper, numpy_helper, shape_inference
+from onnx import (
+    ModelProto,
+    NodeProto,
+    TensorProto,
+    TypeProto,
+    helper,
+    numpy_helper,
+    shape_inference,
+)
 
 from beers_deploy.quant.domains import Functions, functions_of, operator_name
 from beers_deploy.quant.onnx.window import Pair, Window
@@ -177,7 +184,7 @@ class OnnxGraph:
         shapes: the sizes of tensors by name, 0 for an unknown size; empty until they are inferred.
     """
 
-    def __init__(self, model: onnx.ModelProto) -> None:
+    def __init__(self, model: ModelProto) -> None:
         self._model = model
         self.shapes: dict[str, tuple[int, ...]] = {}
         functions = functions_of(model)
@@ -360,7 +367,7 @@ class OnnxGraph:
         return list(node.attributes.get(key, otherwise))
 
 
-def constants(model: onnx.ModelProto) -> dict[str, np.ndarray]:
+def constants(model: ModelProto) -> dict[str, np.ndarray]:
     """Return the constants of a model by name: initializers, and the values of Constant nodes."""
     arrays = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
     functions = functions_of(model)

@@ -6,12 +6,12 @@ How an image may be cut into tiles for a network is determined in `quant.tiling`
 from collections.abc import Sequence
 from copy import deepcopy
 
-import onnx
+from onnx import ModelProto, TensorProto, ValueInfoProto, helper
 
 from beers_deploy.profiles.errors import ModelError, printable
 
 
-def fixed_tile_px(model: onnx.ModelProto) -> int | None:
+def fixed_tile_px(model: ModelProto) -> int | None:
     """Return the side in pixels of the square image that a model is fixed to, or None if it accepts
     any size.
 
@@ -54,7 +54,7 @@ def require_image(name: str, sizes: Sequence[int], square: bool = True) -> None:
     )
 
 
-def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
+def any_size(model: ModelProto) -> ModelProto:
     """Return a network that is fixed to one size of image as a network for images of any size.
 
     Only networks whose inputs and outputs all have the axes (N, C, H, W) can be changed. Others are
@@ -66,7 +66,7 @@ def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
     return model if fixed_tile_px(model) is None else without_size(model)
 
 
-def without_size(model: onnx.ModelProto) -> onnx.ModelProto:
+def without_size(model: ModelProto) -> ModelProto:
     """Return a network without the sizes that its file states, as `any_size` does, also if its
     image is no square.
     """
@@ -83,7 +83,7 @@ def without_size(model: onnx.ModelProto) -> onnx.ModelProto:
     return copy
 
 
-def image_info(name: str, channels: int, tile_px: int | None) -> onnx.ValueInfoProto:
+def image_info(name: str, channels: int, tile_px: int | None) -> ValueInfoProto:
     """Describe an input or output of a graph that is an image (N, channels, H, W) float32.
 
     Args:
@@ -95,4 +95,4 @@ def image_info(name: str, channels: int, tile_px: int | None) -> onnx.ValueInfoP
     shape: list[str | int | None] = (
         [1, channels, tile_px, tile_px] if tile_px else ["N", channels, "H", "W"]
     )
-    return onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape)
+    return helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)

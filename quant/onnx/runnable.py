@@ -8,8 +8,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 
 import numpy as np
-import onnx
-from onnx import AttributeProto, NodeProto
+from onnx import AttributeProto, ModelProto, NodeProto
 
 from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.domains import INLINE, MICROSOFT, STANDARD, foreign_remedy, opset_of
@@ -46,7 +45,7 @@ FILLING = {"ConstantOfShape", "Expand", "Tile"}
 """Operators that may be computed from constants alone if the file states the size of the result."""
 
 
-def check_runnable(model: onnx.ModelProto, where: str) -> None:
+def check_runnable(model: ModelProto, where: str) -> None:
     """Raise ModelError if a model is not safe or not possible to run.
 
     Its operators must be ONNX's own, or those of onnxruntime that this project writes, and no node

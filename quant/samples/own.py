@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import onnx
+from onnx import ModelProto
 
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.profiles.instrument import MAX_DN
@@ -126,9 +126,7 @@ def digest_of(sample: np.ndarray) -> str:
     return hashlib.sha256(content).hexdigest()[:DIGEST_DIGITS]
 
 
-def samples_of(
-    model: onnx.ModelProto, samples: object, input_range: object = None
-) -> OwnSamples | None:
+def samples_of(model: ModelProto, samples: object, input_range: object = None) -> OwnSamples | None:
     """Read a user's own samples for a network.
 
     Args:

@@ -21,8 +21,8 @@ from dataclasses import dataclass, replace
 from io import BytesIO
 
 import numpy as np
-import onnx
 from numpy.typing import NDArray
+from onnx import ModelProto
 
 from beers_deploy.model.bank import Bank
 from beers_deploy.model.variants import SENSOR_VALUES, Kernels
@@ -118,7 +118,7 @@ class ConditionedCore:
         return json.dumps({name: values.tolist() for name, values in self.biases.items()})
 
 
-def conditioned_core(model: onnx.ModelProto) -> ConditionedCore | None:
+def conditioned_core(model: ModelProto) -> ConditionedCore | None:
     """Read an INT8 file's core together with the biases by which it is conditioned on other
     sensors.
 
@@ -149,7 +149,7 @@ def conditioned_core(model: onnx.ModelProto) -> ConditionedCore | None:
         return ConditionedCore(core, biases)
 
 
-def required_conditioned_core(model: onnx.ModelProto) -> ConditionedCore:
+def required_conditioned_core(model: ModelProto) -> ConditionedCore:
     """Read an INT8 file's core together with the biases by which it is conditioned on other
     sensors.
 
@@ -185,7 +185,7 @@ def bank_layer(bank: Bank, scale: int, shifts: Shifts, kernels: Kernels) -> IntC
     return IntConv("bank", PLANES, BANK, integers.weight, integers.frac_bits, *bias)
 
 
-def delta_of_file(model: onnx.ModelProto) -> bytes:
+def delta_of_file(model: ModelProto) -> bytes:
     """Return the part of an INT8 file that depends on its sensor, called the delta.
 
     A satellite that has the network of one sensor needs only the delta of another (`with_delta`).

@@ -17,7 +17,7 @@ All of it is exact.
 from copy import deepcopy
 
 import numpy as np
-import onnx
+from onnx import ModelProto
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.fold_affine import fold_in_front
@@ -37,7 +37,7 @@ HOST = {"Add", "Clip", "DepthToSpace"}
 """Operators that may follow a pixel shuffle that the host computes."""
 
 
-def activations_first(model: onnx.ModelProto) -> onnx.ModelProto:
+def activations_first(model: ModelProto) -> ModelProto:
     """Move the activations of a float network in front of operations that only move values.
 
     Args:
@@ -57,7 +57,7 @@ def activations_first(model: onnx.ModelProto) -> onnx.ModelProto:
     return network
 
 
-def behind_convolutions(model: onnx.ModelProto) -> onnx.ModelProto:
+def behind_convolutions(model: ModelProto) -> ModelProto:
     """Put convolutions that change nothing in front of activations and pixel shuffles that follow
     no convolution (point 4 of the module).
 

@@ -19,7 +19,7 @@ All of it is exact. The divided nodes remain, and are removed if nothing reads t
 """
 
 import numpy as np
-import onnx
+from onnx import ModelProto
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.fold_affine import is_convolution
@@ -241,7 +241,7 @@ def join_copies(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return [graph.convolution(image, node.result, node.name, np.concatenate(weights))]
 
 
-def broadcasts_channels(model: onnx.ModelProto) -> bool:
+def broadcasts_channels(model: ModelProto) -> bool:
     """Return True if a network adds or multiplies maps of one channel and of several.
 
     Args:

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from copy import deepcopy
 
 import numpy as np
-import onnx
+from onnx import ModelProto
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 
@@ -28,7 +28,7 @@ ON_VALUES = {
 """Operators on each value, which no order of axes changes."""
 
 
-def channels_first(model: onnx.ModelProto) -> None:
+def channels_first(model: ModelProto) -> None:
     """Convert what has its channels last in a network to channels first.
 
     Args:

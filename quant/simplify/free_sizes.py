@@ -30,7 +30,7 @@ from collections.abc import Callable
 from copy import deepcopy
 
 import numpy as np
-import onnx
+from onnx import ModelProto
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Rewriting, sizes_of
@@ -61,11 +61,11 @@ OF_BLOCKS = {
 """Attributes of a Resize that makes a block of each pixel."""
 MOST_VALUES = 1 << 24
 """The largest map that chains are tested on."""
-Fold = Callable[[onnx.ModelProto], onnx.ModelProto]
+Fold = Callable[[ModelProto], ModelProto]
 """A function that folds constants, as onnxruntime does."""
 
 
-def free_rectangle(model: onnx.ModelProto) -> onnx.ModelProto:
+def free_rectangle(model: ModelProto) -> ModelProto:
     """Return the network for images of any size if it is fixed to a height and another width, and
     they have no effect (point 4 of the module); otherwise `model` itself.
 
@@ -82,7 +82,7 @@ def free_rectangle(model: onnx.ModelProto) -> onnx.ModelProto:
     return without_size(model) if is_rectangle and is_local else model
 
 
-def free_sizes(model: onnx.ModelProto, fold: Fold) -> onnx.ModelProto:
+def free_sizes(model: ModelProto, fold: Fold) -> ModelProto:
     """Return the network without arithmetic on the size of its image, if the size has no effect on
     the rest.
 
@@ -122,7 +122,7 @@ def free_sizes(model: onnx.ModelProto, fold: Fold) -> onnx.ModelProto:
     return first
 
 
-def _of_size(model: onnx.ModelProto, rows: int, columns: int, fold: Fold) -> onnx.ModelProto:
+def _of_size(model: ModelProto, rows: int, columns: int, fold: Fold) -> ModelProto:
     """Return the network for images of one size, where the file leaves the size free (1, 2).
 
     Args:

@@ -12,8 +12,7 @@ so the result inside its border too.
 from copy import deepcopy
 
 import numpy as np
-import onnx
-from onnx import shape_inference
+from onnx import ModelProto, shape_inference
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
 
@@ -28,7 +27,7 @@ MOST_PX = 128
 """The largest border that a network without padding can lack."""
 
 
-def with_missing_border(model: onnx.ModelProto) -> onnx.ModelProto:
+def with_missing_border(model: ModelProto) -> ModelProto:
     """Return a network whose result has the size of its image, by mirroring the image beyond its
     borders first.
 
@@ -67,7 +66,7 @@ def with_missing_border(model: onnx.ModelProto) -> onnx.ModelProto:
     return network
 
 
-def _missing_px(model: onnx.ModelProto) -> int:
+def _missing_px(model: ModelProto) -> int:
     """Return how many pixels of a border are missing at each side; 0 for none (1)."""
     dims = model.graph.input[0].type.tensor_type.shape.dim
     if len(model.graph.input) != 1 or len(model.graph.output) != 1 or len(dims) != 4:

@@ -40,9 +40,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-import onnx
 import onnxruntime as ort
-from onnx import TensorProto, numpy_helper, version_converter
+from onnx import GraphProto, ModelProto, TensorProto, helper, numpy_helper, version_converter
 from onnx.shape_inference import InferenceError
 
 from beers_deploy.profiles.errors import ModelError, reason_of
@@ -120,7 +119,7 @@ INTEGERS = (TensorProto.UINT8, TensorProto.UINT16)
 OTHER_FLOATS = (TensorProto.FLOAT16, TensorProto.BFLOAT16, TensorProto.DOUBLE)
 
 
-def simplify(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
+def simplify(model: ModelProto, where: str) -> ModelProto:
     """Rewrite a float network as exporters write it to the form that the rest of this project
     reads.
 
@@ -139,7 +138,7 @@ def simplify(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
         return with_missing_border(network)
 
 
-def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
+def _simplified(model: ModelProto, where: str) -> ModelProto:
     network = deepcopy(model)
     _to_float_image(network.graph)
     _to_float32(network)
@@ -163,7 +162,7 @@ def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     return network
 
 
-def _run_passes(model: onnx.ModelProto) -> None:
+def _run_passes(model: ModelProto) -> None:
     """Rewrite the nodes of a network in place, without renaming its inputs and outputs."""
     graph = OnnxGraph(model)
     graph.shapes = float_shapes(graph)
@@ -216,7 +215,7 @@ def _run_passes(model: onnx.ModelProto) -> None:
     graph.save()
 
 
-def _is_plain(model: onnx.ModelProto) -> bool:
+def _is_plain(model: ModelProto) -> bool:
     weights = {tensor.name for tensor in model.graph.initializer}
     is_of_plain_operators = (
         opset_of(model) == OPSET
@@ -238,7 +237,7 @@ def _is_plain(model: onnx.ModelProto) -> bool:
     return not has_other_convolutions and not broadcasts_channels(model)
 
 
-def _to_float_image(graph: onnx.GraphProto) -> None:
+def _to_float_image(graph: GraphProto) -> None:
     """Let an image of integers that is cast before anything is computed be float32."""
     images = {v.name for v in graph.input if v.type.tensor_type.elem_type in INTEGERS}
     for node in graph.node:
@@ -251,7 +250,7 @@ def _to_float_image(graph: onnx.GraphProto) -> None:
                 value.type.tensor_type.elem_type = TensorProto.FLOAT
 
 
-def _to_float32(model: onnx.ModelProto) -> None:
+def _to_float32(model: ModelProto) -> None:
     """Convert floats of 16 and 64 bits to float32, in weights and in all computations."""
     graph = model.graph
     for value in (*graph.input, *graph.output, *graph.value_info):
@@ -268,7 +267,7 @@ def _to_float32(model: onnx.ModelProto) -> None:
             attribute.i = TensorProto.FLOAT if attribute.i in OTHER_FLOATS else attribute.i
 
 
-def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
+def _folded(model: ModelProto, where: str) -> ModelProto:
     """Apply onnxruntime's basic optimisation, and return the network with operators of this
     project's opset.
     """
@@ -277,7 +276,7 @@ def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     options.intra_op_num_threads = 1
     # What fails is raised, so that a message of the runtime would say it twice.
     options.log_severity_level = 4
-    network = onnx.ModelProto()
+    network = ModelProto()
     with TemporaryDirectory() as folder:
         path = Path(folder) / "folded.onnx"
         options.optimized_model_filepath = str(path)
@@ -299,10 +298,10 @@ def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     return _of_our_opset(network)
 
 
-def _of_our_opset(model: onnx.ModelProto) -> onnx.ModelProto:
+def _of_our_opset(model: ModelProto) -> ModelProto:
     """Convert a network to this project's opset; return it unchanged if that is not possible."""
     version = opset_of(model)
-    _replace(model.opset_import, [onnx.helper.make_opsetid("", version)])
+    _replace(model.opset_import, [helper.make_opsetid("", version)])
     if version == OPSET:
         return model
     try:
@@ -315,7 +314,7 @@ def _of_our_opset(model: onnx.ModelProto) -> onnx.ModelProto:
         if node.op_type == "Resize" and version < RESIZE_HAS_MODES:
             modes = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
             attributes = [a for a in node.attribute if a.name not in modes]
-            attributes += [onnx.helper.make_attribute(*mode) for mode in modes.items()]
+            attributes += [helper.make_attribute(*mode) for mode in modes.items()]
             _replace(node.attribute, attributes)
         # The converter leaves it, though the operator of our opset has no such attribute.
         if node.op_type == "ReduceMean":
@@ -326,7 +325,7 @@ def _of_our_opset(model: onnx.ModelProto) -> onnx.ModelProto:
 RESIZE_HAS_MODES = 11
 
 
-def _tidy(network: onnx.ModelProto, model: onnx.ModelProto) -> None:
+def _tidy(network: ModelProto, model: ModelProto) -> None:
     """Restore the metadata of the original file, and remove constants that no node reads."""
     network.ir_version = IR_VERSION
     network.producer_name = model.producer_name

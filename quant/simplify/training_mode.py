@@ -5,7 +5,7 @@ Such a network returns another result for each run or for each tile. It is rejec
 nodes are folded.
 """
 
-import onnx
+from onnx import ModelProto
 
 from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.domains import opset_of
@@ -18,7 +18,7 @@ they are in training mode.
 DROPOUT_MODE_INPUT = 2
 
 
-def require_inference(model: onnx.ModelProto, where: str) -> None:
+def require_inference(model: ModelProto, where: str) -> None:
     """Raise ModelError if a network has a node in training mode.
 
     Args:

@@ -25,8 +25,7 @@ import math
 from dataclasses import dataclass
 from fractions import Fraction
 
-import onnx
-from onnx import TypeProto
+from onnx import ModelProto, TypeProto
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph.pixel_shuffle import MOVES, with_shuffles
@@ -86,7 +85,7 @@ class Tiling:
         )
 
 
-def tiling_of(model: onnx.ModelProto, where: str = "") -> Tiling:
+def tiling_of(model: ModelProto, where: str = "") -> Tiling:
     """Determine how an image may be cut into tiles for a network, float or INT8.
 
     Args:
