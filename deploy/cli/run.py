@@ -106,7 +106,10 @@ def _result(command: Command, options: dict[str, Any], json: Path | None) -> Any
         delete_older(command.verb, arguments)
         delete_results(json, paths_of(command.verb, arguments).inputs)
         require_apart(command.verb, arguments, json)
-    return command.verb(**arguments)
+    result = command.verb(**arguments)
+    if json is not None and isinstance(result, str):
+        raise OptionError("--json has no effect with --toml. Leave one of the two out.")
+    return result
 
 
 def table_of(result: Any) -> Any:

@@ -158,6 +158,7 @@ def test_profiles_show_scenes_targets_and_sensors_with_every_source() -> None:
     output = done("profiles pleiades-degraded")
     assert "gain_dn_per_radiance" in output
     assert "assumed" in output
+    assert "no effect with --toml" in refused("profiles pleiades-degraded --toml --json -")
 
 
 def test_a_description_is_shown_and_not_obeyed(tmp_path: Path) -> None:
