@@ -411,7 +411,8 @@ def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
             reason = reason_of(error)
             raise ModelError(
                 f"torch cannot export the module {type(module).__name__}: {reason}. Check that it "
-                f"accepts an image of {times(example)}, or give example=(N, C, H, W)."
+                f"accepts an image of {times(example)}, or load it first with "
+                "Network.load(module, example=(N, C, H, W))."
             ) from error
         finally:
             # `eval` changed the caller's own module.

@@ -1,8 +1,9 @@
 """Define the constants that a profile stores: a number or a list of names, with its provenance."""
 
-import sys
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass as plain_dataclass
+from numbers import Real
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, GetCoreSchemaHandler, PlainValidator, model_validator
@@ -21,13 +22,15 @@ measured values. "assumed": chosen by this project. "stated": given by the user.
 
 
 def is_number(raw: object) -> bool:
-    """Return True if a value that was read from a file is a finite number that float64 can hold."""
-    return (
-        # Python counts True as an int. TOML allows integers of any size, which float64 cannot hold.
-        isinstance(raw, int | float)
-        and not isinstance(raw, bool)
-        and abs(raw) <= sys.float_info.max
-    )
+    """Return True if a value of a user is a finite number that float64 can hold."""
+    # Python counts True as an int.
+    if isinstance(raw, bool) or not isinstance(raw, Real):
+        return False
+    try:
+        return math.isfinite(float(raw))
+    # TOML allows integers of any size.
+    except OverflowError:
+        return False
 
 
 def _number(raw: Any) -> float | tuple[float, float]:

@@ -120,7 +120,7 @@ def tiling_of(model: ModelProto, where: str = "") -> Tiling:
         )
 
 
-def geometry_of(model: onnx.ModelProto, where: str = "") -> Tiling:
+def geometry_of(model: ModelProto, where: str = "") -> Tiling:
     """Determine how an image may be cut into tiles, as `tiling_of` does, also for a network of
     fixed size that reads its whole tile, such as by squeeze and excite.
 

@@ -234,11 +234,11 @@ def test_a_path_in_the_place_of_pixels_is_refused(value: Any) -> None:
 
 def test_the_side_of_a_core_may_be_an_integer_of_numpy_and_no_text() -> None:
     network = bd.Network.load("convbeers-xs-int8")
-    core = network.core(tile=np.int64(64))  # type: ignore[arg-type]
-    assert fixed_tile_px(core.model) == 70
+    side: Any = np.int64(64)
+    assert fixed_tile_px(network.core(tile=side).model) == 70
     for side in ("64", 0, -64, 64.0):
         with pytest.raises(OptionError, match="`tile` must be a multiple of 1 px"):
-            network.core(tile=side)  # type: ignore[arg-type]
+            network.core(tile=side)
 
 
 def test_an_empty_list_of_boards_is_refused() -> None:

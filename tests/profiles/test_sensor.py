@@ -197,3 +197,10 @@ def test_the_units_of_another_sensor_bring_its_offset_and_no_other_effect(tmp_pa
 def test_noise_in_both_ways_is_refused_by_replace() -> None:
     with pytest.raises(ProfileError, match="noise must have snr_0 and snr_1, or alpha and beta"):
         Sensor.load("pleiades-degraded").replace(alpha=1.0, snr_0=3.0)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int64])
+def test_a_number_of_numpy_replaces_one_of_a_sensor(kind: type) -> None:
+    sensor = Sensor.load("pleiades-degraded").replace(snr_1=kind(100), snr_0=(kind(40), kind(45)))
+    assert sensor.snr_pair[1].value == 100
+    assert sensor.snr_pair[0].value == (40, 45)

@@ -29,9 +29,10 @@ from beers_deploy.model.pairs_recipe import read_pairs_recipe
 from beers_deploy.model.raster.images import list_images
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.pairs import Pair
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.quant.untrusted import times
 from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.restoration.method import Restore
 from beers_deploy.restoration.sensor_check.check import WINDOW_PX, check_windows
@@ -252,7 +253,17 @@ def _method(
         return replace(method_named(source, *sensors, around), name=name)
     # A module of torch is callable too, but it is a network and no function.
     if callable(source) and not isinstance(source, Network) and not hasattr(source, "state_dict"):
-        return Method(name, source, "what the function knows")
+
+        def restore(image: np.ndarray) -> np.ndarray:
+            restored = np.asarray(source(image))
+            if restored.shape != image.shape:
+                raise ImageError(
+                    f"The function {name} must return an image of {times(image.shape)}, got "
+                    f"{times(restored.shape) or 'no array'}. Return one value for each pixel."
+                )
+            return restored
+
+        return Method(name, restore, "what the function knows")
     network = Network.load(cast("NetworkLike", source), sensor=sensors[0])
     network = to_run_on(network, sensors[0])
     return method_of(name, network, *sensors, around)

@@ -1,16 +1,18 @@
 """Tests of the command `evaluate`, of the images on its page, and of its tables."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from beers_deploy.model.raster.writer import write_tiff
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.studies.evaluation.compression import GAIN, LOSSLESS
 from beers_deploy.studies.evaluation.methods import Method
 from beers_deploy.studies.evaluation.run import strip_of
 from beers_deploy.verbs.evaluate import evaluate
+from beers_deploy.verbs.simulate import simulate
 from tests.deploy.command_line import done
 from tests.deploy.documents import figures_of, valid
 from tests.deploy.studies.evaluation.small_pairs import (
@@ -51,6 +53,14 @@ def test_the_command_on_a_folder_of_pairs(tmp_path: Path, monkeypatch: pytest.Mo
     compressed = [row["name"] for row in document["rows"] if row["table"] in (GAIN, LOSSLESS)]
     assert compressed == ["traditional-fast, 6 bit/px", "traditional-fast"]
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.png", "b.png", "report.html"]
+
+
+def test_a_function_that_returns_another_shape_is_refused() -> None:
+    image: Any = simulate(size=64, progress=False)
+    functions: dict[str, Any] = {"no array": lambda _: None, "5 x 64": lambda dn: dn[:5]}
+    for words, function in functions.items():
+        with pytest.raises(ImageError, match=f"function mine must return .* 64 x 64, got {words}"):
+            evaluate(methods={"mine": function}, pairs=[image])
 
 
 def test_no_pair_at_all_is_refused() -> None:
