@@ -16,7 +16,6 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
-from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -194,17 +193,13 @@ class TrainableCore(torch.nn.Module):
         # factors are powers of two, so float32 stays exact.
         unit = 2.0 ** (frac_bits - op.weight_frac_bits - self._core.frac_bits[op.input])
         bias_unit = 2.0 ** (frac_bits - op.bias_frac_bits)
+        weight = to_int8(weight) * unit
         if op.output == CORRECTION and decoding.copies > 1:
-            return _products(
-                op,
-                image,
-                to_int8(weight) * unit,
-                (bias if decoding.offsets else to_int8(bias)) * bias_unit,
-            )
+            bias = bias if decoding.offsets else to_int8(bias)
+            return _products(op, image, weight, bias * bias_unit)
         # The lift that makes ties round up costs nothing in the bias.
         bias = to_int8(bias) * bias_unit + _lift(op.activation) * unit
-        sums = _products(op, image, to_int8(weight) * unit, bias)
-        return _rounded(sums, op.activation, frac_bits)
+        return _rounded(_products(op, image, weight, bias), op.activation, frac_bits)
 
 
 def _whole(values: Tensor) -> np.ndarray:
@@ -299,10 +294,10 @@ def _average_pool(op: AveragePool, inputs: Sequence[Tensor], _: Bits) -> Tensor:
 
 def _padded(image: Tensor, window: Window, fill: float = 0.0) -> Tensor:
     """Pad an image (N, C, H, W) by the pads of a window with one value."""
+    if not any(window.pads):
+        return image
     top, left, bottom, right = window.pads
-    return (
-        functional.pad(image, (left, right, top, bottom), value=fill) if any(window.pads) else image
-    )
+    return functional.pad(image, (left, right, top, bottom), value=fill)
 
 
 def _resize(op: Resize, inputs: Sequence[Tensor], _: Bits) -> Tensor:
@@ -339,18 +334,16 @@ def _pointwise(op: Pointwise, inputs: Sequence[Tensor], bits: Bits) -> Tensor:
     return torch.addcmul(result, image - image.detach(), slope)
 
 
-_OPERATIONS: Mapping[type, Callable[..., Tensor]] = MappingProxyType(
-    {
-        Add: _add,
-        Mul: _mul,
-        Concat: lambda _, inputs, __: torch.cat(list(inputs), dim=1),
-        MaxPool: _max_pool,
-        AveragePool: _average_pool,
-        Resize: _resize,
-        Shuffle: _shuffle,
-        Pointwise: _pointwise,
-    }
-)
+_OPERATIONS: Mapping[type, Callable[..., Tensor]] = {
+    Add: _add,
+    Mul: _mul,
+    Concat: lambda _, inputs, __: torch.cat(list(inputs), dim=1),
+    MaxPool: _max_pool,
+    AveragePool: _average_pool,
+    Resize: _resize,
+    Shuffle: _shuffle,
+    Pointwise: _pointwise,
+}
 
 
 def _one_copy(op: IntConv, host_part: HostPart) -> IntConv:
@@ -371,12 +364,8 @@ def _all_copies(
     """Move all copies as one was trained, the coarse one by an eighth; a window's bias moves the
     host's offsets.
 
-    Args:
-        last: the convolution that writes the copies, as it was.
-        host_part: the host part of the core, as it was.
-        weight: the weight of the copy that was trained, (O, I, kh, kw) in integers.
-        bias: the bias of that copy, (O,), in integers; of a window in units of its scale with the
-            offset.
+    `weight` (O, I, kh, kw) and `bias` (O,) are those of the trained copy, in integers; the bias of
+    a window is in units of its scale, with the offset.
     """
     one = _one_copy(last, host_part)
     decoding = host_part.decoding
@@ -402,12 +391,8 @@ def _window_bias(one: IntConv, decoding: OutputDecoding) -> np.ndarray:
 
 
 def _moved(copies: np.ndarray, shares: np.ndarray, move: np.ndarray) -> np.ndarray:
-    """Move copies, which lie one behind the other, each by its share, in integers.
-
-    Args:
-        copies: int8 numbers of all copies, the copies' channels in the first axis.
-        shares: (copies,) the share of the move that each copy makes.
-        move: the change of the copy that was trained.
+    """Move int8 copies, which lie one behind the other along the first axis, each by its share of
+    the move of the copy that was trained.
     """
     moves = np.rint(np.multiply.outer(shares, move)).reshape(copies.shape)
     return np.asarray(np.clip(copies + moves, INT8_MIN, INT8_MAX), np.int8)

@@ -346,9 +346,7 @@ class OnnxGraph:
         """
         return self.constants.get(node.inputs[place]) if place < len(node.inputs) else None
 
-    def numbers(
-        self, node: Node, place: int, key: str, otherwise: Sequence[float] = ()
-    ) -> list[Any] | None:
+    def numbers(self, node: Node, place: int, key: str) -> list[Any] | None:
         """Return the numbers that a node states in a constant input or, in older opsets, in an
         attribute.
 
@@ -356,15 +354,15 @@ class OnnxGraph:
             node: the node.
             place: the number of the input, from 0 on.
             key: the name of the attribute.
-            otherwise: the numbers that are returned if the node states none.
 
         Returns:
-            The numbers; None if other nodes compute the input.
+            The numbers, an empty list if the node states none; None if other nodes compute the
+            input.
         """
         if place < len(node.inputs) and node.inputs[place]:
             value = self.value(node, place)
             return None if value is None else list(value.ravel().tolist())
-        return list(node.attributes.get(key, otherwise))
+        return list(node.attributes.get(key, ()))
 
 
 def constants(model: ModelProto) -> dict[str, np.ndarray]:

@@ -112,9 +112,9 @@ class AxisNode:
         Raises:
             ModelError: other nodes compute the input.
         """
-        values = self.graph.numbers(self.node, place, key, otherwise)
+        values = self.graph.numbers(self.node, place, key)
         self.require(values is not None, "has sizes that are computed (fold them)")
-        return values or []
+        return values or list(otherwise)
 
     def own(self, numbers: Sequence[Any], axes: Sequence[int], otherwise: Any) -> Any:
         """Select from numbers for several axes the one for the node's side, rows or columns.
