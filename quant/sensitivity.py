@@ -35,7 +35,6 @@ from beers_deploy.quant.quantize import FINETUNE, Quantized
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import (
     few_crops,
-    halo_of,
     open_session,
     planes_of,
     result_of,
@@ -162,7 +161,8 @@ def layer_errors(
     scale = core.scale(CORRECTION)
     ranges = core.host_part.input_ranges
     for crop in crops:
-        (values,) = tensor_values(float_session, names, crop, halo_of(graph), core.host_part)
+        # A crop is one tile, also that of a network which is fixed to a larger size.
+        (values,) = tensor_values(float_session, names, crop, None, core.host_part)
         float_values = dict(zip(names, values, strict=True))
         restored = core.host_part.restore(crop, float_values[CORRECTION], scale)
         restored = to_shares(restored, ranges)

@@ -260,7 +260,8 @@ def replaced(
     graph.rewrite(lambda _, node: plan.get(node))
     graph.rewrite(fold_behind)
     graph.save()
-    fold_in_front(graph, float_shapes(graph))
+    graph.shapes = float_shapes(graph)
+    fold_in_front(graph)
     graph.save()
     network = activations_first(network)
     if Kind.padding in approximated:

@@ -87,7 +87,7 @@ def behind_convolutions(model: ModelProto) -> ModelProto:
         ]
 
     graph.rewrite(with_copy)
-    fold_in_front(graph, graph.shapes)
+    fold_in_front(graph)
     graph.save()
     return network
 

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
-from beers_deploy.quant.simplify.standard_operators import Shapes
 
 NORMALISATION = "BatchNormalization"
 LACKING = {NORMALISATION, "Div", "Neg"}
@@ -96,13 +95,12 @@ def fold_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return []
 
 
-def fold_in_front(graph: OnnxGraph, shapes: Shapes) -> None:
+def fold_in_front(graph: OnnxGraph) -> None:
     """Fold nodes that scale and shift channels into the convolutions behind them, where that is
     exact (point 3 of the module).
 
     Args:
-        graph: the graph, which is changed in place.
-        shapes: the sizes of each float tensor by name, as `float_shapes` returns them.
+        graph: the graph, which is changed in place; it knows the sizes of its tensors.
     """
     folded = set()
     for node in graph.nodes[::-1]:
@@ -113,8 +111,7 @@ def fold_in_front(graph: OnnxGraph, shapes: Shapes) -> None:
             continue
         source, affine = match
         # One channel times many constants would be many channels.
-        sizes = shapes.get(source, ())
-        if affine.channels not in (1, sizes[1] if len(sizes) == 4 else 0):
+        if affine.channels not in (1, graph.channels(source)):
             continue
         if all(_may_take_in(graph, reader, result, affine) for reader in behind):
             for reader in behind:

@@ -192,7 +192,7 @@ def _run_passes(model: ModelProto) -> None:
         graph.rewrite(rewriting)
     graph.save()
     graph.shapes = float_shapes(graph)
-    fold_in_front(graph, graph.shapes)
+    fold_in_front(graph)
     for with_shapes in (
         repeat_channels,
         drop_cast,
@@ -209,7 +209,7 @@ def _run_passes(model: ModelProto) -> None:
         fold_behind,
     ):
         graph.rewrite(with_shapes)
-    fold_in_front(graph, graph.shapes)
+    fold_in_front(graph)
     for last in (read_unselected, join_copies, ConnectByConvolutions()):
         graph.rewrite(last)
     graph.save()

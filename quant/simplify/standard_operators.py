@@ -7,8 +7,6 @@ from onnx import TensorProto
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
 
-Shapes = dict[str, tuple[int, ...]]
-
 HALF_PIXEL = "half_pixel", "pytorch_half_pixel"
 NEAREST: dict[str, Callable[[float], float]] = {
     "ceil": np.ceil,
@@ -19,7 +17,7 @@ NEAREST: dict[str, Callable[[float], float]] = {
 """How each mode of a nearest Resize rounds a place."""
 
 
-def float_shapes(graph: OnnxGraph) -> Shapes:
+def float_shapes(graph: OnnxGraph) -> dict[str, tuple[int, ...]]:
     """Infer the sizes of each float32 tensor of a graph.
 
     Returns:

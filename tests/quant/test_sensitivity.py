@@ -15,9 +15,9 @@ from beers_deploy.quant.graph import Add
 from beers_deploy.quant.passes.selection import Passes
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.samples.patches import Patches
-from beers_deploy.quant.sensitivity import Loss, layer_errors, losses
+from beers_deploy.quant.sensitivity import Loss, layer_error_rows, layer_errors, losses
 from beers_deploy.quant.session import few_crops, open_session, result_of, run
-from tests.quant.quick import patches_of, quickly, without_references
+from tests.quant.quick import image, patches_of, quickly, without_references
 from tests.quant.simplify.networks import parsed
 
 CORRUPTED = "body.1.second"
@@ -71,6 +71,20 @@ def test_an_image_that_is_added_before_a_pixel_shuffle_is_no_error(
     ]
     assert together.mae == pytest.approx(np.mean(errors), rel=1e-3)
     assert together.sqnr_db > 20
+
+
+def test_a_network_of_a_large_fixed_size_is_attributed_on_whole_images() -> None:
+    """Images of more than 128 pixels a side are several tiles for other networks."""
+    model = parsed(
+        "y = Conv<pads=[1,1,1,1]>(x, w)",
+        "float[1,1,132,132] x => float[1,1,132,132] y",
+        constants={"w": np.random.default_rng(0).normal(0, 0.1, (1, 1, 3, 3))},
+    )
+    patches = patches_of([image(132, 132)])
+    layer, together = layer_error_rows(quickly(model, patches), patches)
+    key = "share of squared error"
+    assert layer.figures[key].value == pytest.approx(100)
+    assert together.name == "all layers"
 
 
 @pytest.fixture(scope="module")
