@@ -77,6 +77,7 @@ def refused(path: Path, words: str) -> None:
         {"blocks": "many", "features": 4},
         {"blocks": 1, "features": 4, "scale": 2},
         {"blocks": 1, "features": 4, "scale": 0},
+        {"blocks": 1, "features": 4, "scale": -1},
         "convbeers",
         None,
     ],
@@ -86,6 +87,14 @@ def test_a_header_that_does_not_fit_the_tensors_is_refused(variant: object, tmp_
         tmp_path / "w.safetensors", arrays(plain(Variant(1, 4)).state_dict()), {"variant": variant}
     )
     refused(tmp_path / "w.safetensors", r"weights of a ConvBEERS|number")
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float16, np.int32])
+def test_weights_of_another_type_are_refused(kind: type, tmp_path: Path) -> None:
+    tensors = arrays(plain(Variant(1, 4)).state_dict())
+    other = {name: value.astype(kind) for name, value in tensors.items()}
+    write_tensors(tmp_path / "w.safetensors", other, {"variant": {"blocks": 1, "features": 4}})
+    refused(tmp_path / "w.safetensors", "not finite float32")
 
 
 @pytest.mark.parametrize(
