@@ -1,6 +1,7 @@
-"""Replace activations that a DPU lacks by ones that it computes, if a user asks for it.
+"""Replace operators that a DPU lacks by ones that it computes, if a user asks for it.
 
-- `replacements`: which operators are replaced, by another function or exactly;
+- `kinds`: which operators are replaced;
+- `replacements`: by what, another function or the same spelled otherwise;
 - `compensation`: fits the convolutions behind another function to the original network;
 - `adaptation`: chooses for each kind of operator, and measures the loss.
 """

@@ -17,13 +17,8 @@ import onnx
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.figures import Figure, Row
 from beers_deploy.quant.adapt.compensation import compensated
-from beers_deploy.quant.adapt.replacements import (
-    APPROXIMATIONS,
-    EXACT,
-    Kind,
-    nodes_by_kind,
-    replaced,
-)
+from beers_deploy.quant.adapt.kinds import APPROXIMATIONS, EXACT, Kind, nodes_by_kind
+from beers_deploy.quant.adapt.replacements import replaced
 from beers_deploy.quant.gate import GateResult, compare, figure_of
 from beers_deploy.quant.graph import read_network
 from beers_deploy.quant.onnx.graph import OnnxGraph

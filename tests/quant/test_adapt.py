@@ -16,7 +16,8 @@ import beers_deploy as bd
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.quant.adapt.adaptation import ADAPTED, NEAR_DB, adapt
 from beers_deploy.quant.adapt.compensation import Equations, compensated
-from beers_deploy.quant.adapt.replacements import EXACT, Kind, nodes_by_kind, replaced
+from beers_deploy.quant.adapt.kinds import EXACT, Kind, nodes_by_kind
+from beers_deploy.quant.adapt.replacements import replaced
 from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.graph import Activation, Add, Pointwise, Resize, read_network, read_planes

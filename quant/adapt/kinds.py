@@ -1,0 +1,189 @@
+"""Tell which operators of a float network a DPU lacks, by the kind of what replaces them.
+
+The numbers are those of `quant.adapt.replacements`.
+"""
+
+from enum import StrEnum
+
+import numpy as np
+
+from beers_deploy.quant.adapt.zero_padding import pads_of
+from beers_deploy.quant.graph.attention import shrinking
+from beers_deploy.quant.graph.deviation import deviation
+from beers_deploy.quant.graph.host_end import host_end
+from beers_deploy.quant.graph.operations import LEAKY_SLOPE
+from beers_deploy.quant.graph.resize import Resizing, alone_enlarges_image
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.simplify.fold_affine import per_channel
+from beers_deploy.quant.simplify.spelled_activations import gelu_gate_input, other_operand
+from beers_deploy.quant.simplify.standard_operators import float_shapes
+
+
+class Kind(StrEnum):
+    """A kind of operator that a DPU lacks and that can be replaced. Its value is the name in
+    tables.
+    """
+
+    silu = "SiLU, GELU or Mish"
+    sigmoid = "Sigmoid"
+    tanh = "Tanh"
+    hard_sigmoid = "HardSigmoid of another slope"
+    leaky_relu = "LeakyReLU of another slope"
+    prelu = "PReLU"
+    attention = "spatial attention (ESA)"
+    padding = "reflecting padding"
+    bilinear = "other bilinear enlargement"
+    cubic = "bicubic enlargement"
+    deviation = "standard deviation over the image"
+
+
+APPROXIMATIONS = {
+    Kind.silu: "HardSwish",
+    Kind.sigmoid: "HardSigmoid",
+    Kind.tanh: "a clipped line",
+    Kind.leaky_relu: "LeakyReLU of 26/256",
+    Kind.prelu: "LeakyReLU of 26/256",
+    Kind.attention: "attention on an eighth of the sides",
+    Kind.padding: "zeros around the mirrored image",
+    Kind.bilinear: "bilinear by 4 and 2 with half-pixel centres",
+    Kind.cubic: "a transposed convolution of the mirrored image",
+    Kind.deviation: "the mean absolute deviation",
+}
+"""The other function that replaces each kind (1 to 3, and 6 to 10)."""
+EXACT = {
+    Kind.hard_sigmoid: "HardSigmoid of a scaled input",
+    Kind.leaky_relu: "ReLU in a second branch, and an Add",
+    Kind.prelu: "ReLU in a second branch, and an Add",
+}
+"""The exact replacement of each kind (4 and 5)."""
+
+
+def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
+    """Return the kind of replaceable operator that a node is, if a DPU lacks it.
+
+    Args:
+        graph: the graph that the node belongs to.
+        node: any node.
+
+    Returns:
+        The kind; None if the node is not replaced, such as a Sigmoid that is a part of a SiLU.
+    """
+    attributes = node.attributes
+    resizing = Resizing.of(node, graph) if node.op_type == "Resize" else None
+    kinds = {
+        Kind.attention: shrinking(graph, node),
+        Kind.silu: silu_input(graph, node),
+        Kind.padding: pads_of(graph, node),
+        Kind.deviation: node.op_type in ("Pow", "Sqrt") and deviation(graph, node),
+        Kind.bilinear: resizing is not None and resizing.is_nearly_bilinear,
+        Kind.cubic: alone_enlarges_image(graph, node),
+    }
+    for kind, is_of_kind in kinds.items():
+        if is_of_kind:
+            return kind
+    if node.op_type in ("Sigmoid", "Tanh"):
+        (result,) = node.outputs
+        readers = graph.readers[result]
+        part_of_silu = readers and all(silu_input(graph, reader) for reader in readers)
+        return None if part_of_silu else Kind[node.op_type.lower()]
+    if node.op_type == "HardSigmoid":
+        slope = attributes.get("alpha", 0.2)
+        is_plain = np.allclose((slope, attributes.get("beta", 0.5)), (1 / 6, 0.5), 1e-4)
+        return None if is_plain or not slope else Kind.hard_sigmoid
+    slopes = slopes_of(graph, node)
+    if slopes is None:
+        return None
+    if node.op_type == "PRelu":
+        return Kind.prelu
+    return None if slopes[0] == np.float32(LEAKY_SLOPE) else Kind.leaky_relu
+
+
+def silu_input(graph: OnnxGraph, node: Node) -> str:
+    """Return the tensor x if a node completes an activation that HardSwish approximates.
+
+    That is a GELU or Mish of x, or x * Sigmoid(c x) with a constant c: 1 for SiLU, 1.702 for the
+    quick GELU.
+
+    Args:
+        graph: the graph that the node belongs to.
+        node: any node.
+
+    Returns:
+        The name of x; "" if the node computes something else.
+    """
+    if node.op_type in ("Gelu", "Mish"):
+        return node.inputs[0]
+    if node.op_type == "Mul":
+        for source, gate in (node.inputs, node.inputs[::-1]):
+            gelu = gelu_gate_input(graph, gate)
+            if gelu and other_operand(graph, graph.writers.get(source), "Mul", 0.5) == gelu:
+                return gelu
+            before = graph.writers.get(gate)
+            halved = other_operand(graph, before, "Mul", 0.5)
+            if halved and gelu_gate_input(graph, halved) == source:
+                return source
+            if before is not None and _is_gate(graph, before, source):
+                return source
+    return ""
+
+
+def _is_gate(graph: OnnxGraph, node: Node, source: str) -> bool:
+    """Return True if a node is Sigmoid(c x) or Tanh(Softplus(x)) of a tensor x."""
+    name = node.inputs[0]
+    before = graph.writers.get(name)
+    if node.op_type == "Tanh":
+        return before is not None and before.op_type == "Softplus" and source in before.inputs
+    is_source = name == source or (before is not None and _by_constant(graph, before, source))
+    return node.op_type == "Sigmoid" and is_source
+
+
+def _by_constant(graph: OnnxGraph, node: Node, source: str) -> bool:
+    """Return True if a node multiplies a tensor by a constant number.
+
+    Args:
+        graph: the graph that the node belongs to.
+        node: any node.
+        source: name of the tensor.
+    """
+    if node.op_type != "Mul" or source not in node.inputs:
+        return False
+    factor = node.inputs[1 - node.inputs.index(source)]
+    before = graph.writers.get(factor)
+    # The runtime leaves a Cast of the constant of a Swish.
+    name = before.inputs[0] if before is not None and before.op_type == "Cast" else factor
+    return name in graph.constants and graph.constants[name].size == 1
+
+
+def slopes_of(graph: OnnxGraph, node: Node) -> np.ndarray | None:
+    """Return the slopes that a LeakyReLU or PReLU has for values below 0.
+
+    Args:
+        graph: the graph that the node belongs to.
+        node: any node.
+
+    Returns:
+        (C,), or (1,) for all channels. None for another node, or if the slopes are not one constant
+        per channel.
+    """
+    if node.op_type == "LeakyRelu":
+        return np.array([node.attributes.get("alpha", 0.01)], np.float32)
+    return per_channel(graph.value(node, 1)) if node.op_type == "PRelu" else None
+
+
+def nodes_by_kind(graph: OnnxGraph) -> dict[Kind, list[Node]]:
+    """Return the nodes of a network that can be replaced, in lists by their kind, in the graph's
+    order.
+
+    The sizes of the graph's tensors are inferred and stored in it, too.
+    """
+    nodes: dict[Kind, list[Node]] = {}
+    graph.shapes = float_shapes(graph)
+    on_host = host_end(graph).replaced
+    for node in graph.nodes:
+        kind = kind_of(graph, node)
+        if kind is not None and node.outputs[0] not in on_host:
+            nodes.setdefault(kind, []).append(node)
+    # The host mirrors the image itself.
+    if all(node.inputs[0] in graph.inputs for node in nodes.get(Kind.padding, [])):
+        nodes.pop(Kind.padding, None)
+    return nodes
