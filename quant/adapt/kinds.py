@@ -12,8 +12,8 @@ from beers_deploy.quant.graph.attention import shrinking
 from beers_deploy.quant.graph.deviation import deviation
 from beers_deploy.quant.graph.host_end import host_end
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
-from beers_deploy.quant.graph.resize import Resizing, alone_enlarges_image
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.resize import Resizing, alone_enlarges_image
 from beers_deploy.quant.simplify.fold_affine import per_channel
 from beers_deploy.quant.simplify.spelled_activations import gelu_gate_input, other_operand
 from beers_deploy.quant.simplify.standard_operators import float_shapes

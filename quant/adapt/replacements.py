@@ -44,8 +44,8 @@ from beers_deploy.quant.graph.attention import aligned
 from beers_deploy.quant.graph.base import REACH_PX, Base
 from beers_deploy.quant.graph.deviation import deviation
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
-from beers_deploy.quant.graph.resize import Resizing, enlarged_bilinearly
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.resize import Resizing, enlarged_bilinearly
 from beers_deploy.quant.simplify.activations_first import activations_first
 from beers_deploy.quant.simplify.fold_affine import (
     fold_behind,

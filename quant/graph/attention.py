@@ -10,8 +10,8 @@ That is another function. `quant.adapt` replaces the original by it, measures th
 compensates it.
 """
 
-from beers_deploy.quant.graph.resize import Resizing, enlarged_bilinearly
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.resize import Resizing, enlarged_bilinearly
 
 BETWEEN = {"Conv", "LeakyRelu", "PRelu", "Relu"}
 """The operators between the maximum and the enlargement."""

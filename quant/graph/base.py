@@ -9,12 +9,12 @@ from typing import Literal
 
 import numpy as np
 
+from beers_deploy.quant.onnx.resize import CUBIC
+
 Mode = Literal["nearest", "linear", "cubic"]
 """The interpolation of an enlarged image, in ONNX's words."""
 REACH_PX = 2
 """The number of pixels around a pixel's own that an enlargement reads at most."""
-CUBIC = -0.75
-"""The coefficient a of cubic convolution in torch and in ONNX's default."""
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from beers_deploy.quant.graph.base import CUBIC, THE_IMAGE, Base, Mode
+from beers_deploy.quant.graph.base import THE_IMAGE, Base, Mode
 from beers_deploy.quant.graph.node_operations import READERS
 from beers_deploy.quant.graph.operations import SIX, Shuffle
-from beers_deploy.quant.graph.resize import Resizing
 from beers_deploy.quant.input_range import is_range
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.resize import CUBIC, Resizing
 
 ACTIVATIONS = {"Sigmoid", "Tanh"}
 

@@ -19,9 +19,9 @@ from beers_deploy.quant.graph.operations import (
     Shuffle,
 )
 from beers_deploy.quant.graph.pixel_shuffle import MOVES, ORDERS
-from beers_deploy.quant.graph.resize import Resizing, alone_enlarges_image
 from beers_deploy.quant.graph.split_network import ADAPT, ADAPT_EXACTLY, REMEDY, unsupported
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.resize import Resizing, alone_enlarges_image
 from beers_deploy.quant.onnx.window import Pair, Window
 
 PAD_STRIDES = (

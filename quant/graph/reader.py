@@ -29,7 +29,6 @@ from beers_deploy.quant.graph.operations import (
     Resize,
 )
 from beers_deploy.quant.graph.pixel_shuffle import with_shuffles
-from beers_deploy.quant.graph.resize import Resizing, enlarges_image
 from beers_deploy.quant.graph.split_network import (
     ADAPT,
     REMEDY,
@@ -45,6 +44,7 @@ from beers_deploy.quant.graph.split_network import (
     unsupported,
 )
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.resize import Resizing, enlarges_image
 from beers_deploy.quant.onnx.runnable import check_runnable
 from beers_deploy.quant.simplify.fold_affine import affine_of
 from beers_deploy.quant.simplify.standard_operators import float_shapes

@@ -1,20 +1,10 @@
 """Replace operators that exporters write in several ways by the one operator that a DPU has."""
 
-from collections.abc import Callable
-
 import numpy as np
 from onnx import TensorProto
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
-
-HALF_PIXEL = "half_pixel", "pytorch_half_pixel"
-NEAREST: dict[str, Callable[[float], float]] = {
-    "ceil": np.ceil,
-    "floor": np.floor,
-    "round_prefer_ceil": lambda place: np.floor(place + 0.5),
-    "round_prefer_floor": lambda place: np.ceil(place - 0.5),
-}
-"""How each mode of a nearest Resize rounds a place."""
+from beers_deploy.quant.onnx.resize import PLACES, ROUNDINGS, Resizing
 
 
 def float_shapes(graph: OnnxGraph) -> dict[str, tuple[int, ...]]:
@@ -302,22 +292,21 @@ def shrink_by_convolution(graph: OnnxGraph, node: Node) -> list[Node] | None:
     Returns:
         The convolution; None if the node is something else, or reads pixels beyond its block.
     """
-    factors = graph.numbers(node, 2, "scales") if node.op_type == "Resize" else None
-    channels = graph.channels(node.source) if factors else 0
-    attribute = node.attributes.get
-    where = attribute("coordinate_transformation_mode", "half_pixel")
-    mode = attribute("mode", "nearest")
-    if not factors or not channels or factors[2] != factors[3] or not 0 < factors[2] < 1:
+    if node.op_type != "Resize" or node.attributes.get("antialias", 0):
         return None
-    block = round(1 / factors[2])
+    resizing = Resizing.of(node, graph)
+    channels = graph.channels(node.source)
+    *_, factor, other_factor = resizing.factors or (0.0, 0.0)
+    is_known = resizing.where in PLACES and resizing.mode in ("linear", "nearest")
+    if not (channels and is_known and 0 < factor < 1) or factor != other_factor:
+        return None
+    block = round(1 / factor)
+    if not np.isclose(block * factor, 1, atol=1e-6):
+        return None
     # The place in a block that the result is interpolated at.
-    places = {"asymmetric": 0.0, **dict.fromkeys(HALF_PIXEL, (block - 1) / 2)}
-    is_known = where in places and mode in ("linear", "nearest") and not attribute("antialias", 0)
-    if not is_known or not np.isclose(block * factors[2], 1, atol=1e-6):
-        return None
-    place = places[where]
-    if mode == "nearest":
-        place = NEAREST[attribute("nearest_mode", "round_prefer_floor")](place)
+    place = PLACES[resizing.where](0, factor)
+    if resizing.mode == "nearest":
+        place = ROUNDINGS[resizing.rounding](place)
     taps = np.maximum(1 - abs(np.arange(block) - place), 0)
     weight = np.broadcast_to(np.outer(taps, taps), (channels, 1, block, block))
     strides = [block, block]

@@ -14,8 +14,8 @@ from itertools import product
 from typing import Any
 
 from beers_deploy.profiles.errors import LONGEST, ModelError, printable
-from beers_deploy.quant.graph.resize import PLACES, ROUNDINGS, Resizing
 from beers_deploy.quant.onnx.graph import WEIGHTS, Node, OnnxGraph
+from beers_deploy.quant.onnx.resize import PLACES, ROUNDINGS, Resizing
 from beers_deploy.quant.onnx.runnable import WINDOW_PX
 from beers_deploy.quant.onnx.window import Window
 from beers_deploy.quant.untrusted import times

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beers_deploy.quant.graph.base import CUBIC
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 
 PLACES: dict[str, Callable[[int, float], float]] = {
@@ -25,7 +24,8 @@ ROUNDINGS: dict[str, Callable[[float], int]] = {
     "round_prefer_floor": lambda place: math.ceil(place - 0.5),
     "round_prefer_ceil": lambda place: math.floor(place + 0.5),
 }
-
+CUBIC = -0.75
+"""The coefficient a of cubic convolution in torch and in ONNX's default."""
 BY_2_OR_4: tuple[tuple[float, ...], ...] = ((1, 1, 2, 2), (1, 1, 4, 4))
 
 
