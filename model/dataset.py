@@ -11,6 +11,7 @@ import logging
 import math
 import multiprocessing
 import shutil
+import signal
 import sys
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping
@@ -252,9 +253,10 @@ def write_dataset(
         if pool is None and workers > 1 and len(waiting) > 1:
             # A forked copy of a library's threads can hang.
             spawn = multiprocessing.get_context("spawn")
-            pool = stack.enter_context(
-                ProcessPoolExecutor(min(workers, MOST_PROCESSES), mp_context=spawn)
-            )
+            # Ctrl-C reaches each process: those of the pool end without a traceback.
+            end = signal.SIGINT, signal.SIG_DFL
+            processes = min(workers, MOST_PROCESSES)
+            pool = stack.enter_context(ProcessPoolExecutor(processes, spawn, signal.signal, end))
         for path, patches in stack.enter_context(
             closing(_patches_by_path(recipe, waiting, workers, pool))
         ):
