@@ -1,12 +1,15 @@
 """ConvBEERS as ONNX: `image` (N, 1, H, W) in [0, 1] to `restored`, written node by node under
 readable names.
 
-The module also converts any float network to ONNX, from an ONNX file or from weights, which may
-need to be conditioned on a sensor.
+The module also converts any float network to ONNX, from an ONNX file, from weights, which may need
+to be conditioned on a sensor, or from a torch module.
 """
 
+import io
+import warnings
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import onnx
@@ -16,11 +19,13 @@ from beers_deploy.model.bank import FILTERS, in_places, network_bank
 from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.io.tensors import Weights, read_conditioned, read_plain
 from beers_deploy.model.levels import INTERVAL
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import ModelError, OptionError, optional, reason_of
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.quant.domains import OPSET
 from beers_deploy.quant.onnx.image_input import image_info
-from beers_deploy.quant.onnx_file import GraphWriter, load_onnx, make_model
+from beers_deploy.quant.onnx_file import GraphWriter, load_onnx, make_model, read_onnx
+from beers_deploy.quant.untrusted import times
 
 if TYPE_CHECKING:
     from beers_deploy.model.convbeers import ConvBEERS
@@ -232,3 +237,49 @@ def about(variant: str, weights: Weights, sensor: str | None = None) -> dict[str
         "reference": str(recipe.get("reference", "")),
         **interval,
     }
+
+
+def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
+    """Export a torch module to ONNX, for any number and size of images.
+
+    Args:
+        module: the torch.nn.Module. Its training mode is restored afterwards.
+        example: shape (N, C, H, W) of an input that the module accepts.
+
+    Returns:
+        The ONNX model, with the input `image` and the output `restored`.
+
+    Raises:
+        ModelError: `module` is not a torch module, or torch cannot export it.
+        MissingExtraError: torch is not installed.
+    """
+    if not hasattr(module, "state_dict"):
+        raise ModelError(
+            "`network` must be a Network, a ModelProto, a torch.nn.Module, a file or a shipped "
+            f"name, got {type(module).__name__}."
+        )
+    torch = optional("torch", "network")
+    free = {name: {0: "N", 2: "H", 3: "W"} for name in ("image", "restored")}
+    stream = io.BytesIO()
+    training = module.training
+    with warnings.catch_warnings():
+        # The exporter's own warnings do not count, because its file is checked below.
+        warnings.simplefilter("ignore")
+        try:
+            names = {"input_names": ["image"], "output_names": ["restored"], "dynamic_axes": free}
+            image = torch.zeros(tuple(example))
+            torch.onnx.export(
+                module.eval(), (image,), stream, opset_version=OPSET, dynamo=False, **names
+            )
+        # The code of a module may raise anything.
+        except Exception as error:
+            reason = reason_of(error)
+            raise ModelError(
+                f"torch cannot export the module {type(module).__name__}: {reason}. Check that it "
+                f"accepts an image of {times(example)}, or load it first with "
+                "Network.load(module, example=(N, C, H, W))."
+            ) from error
+        finally:
+            # `eval` changed the caller's own module.
+            module.train(training)
+    return read_onnx(stream.getvalue(), type(module).__name__)

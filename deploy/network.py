@@ -1,9 +1,7 @@
 """`Network`: an ONNX network and its origin, as the library passes it on."""
 
 import hashlib
-import io
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -14,7 +12,7 @@ import numpy as np
 import onnx
 import onnxruntime as ort
 
-from beers_deploy.float_onnx import float_model, require_tile
+from beers_deploy.float_onnx import exported, float_model, require_tile
 from beers_deploy.model.exposure import UNCHANGED, Exposure, exposures_for
 from beers_deploy.model.shipped import INT8, SENSOR, VARIANT, shipped_names
 from beers_deploy.network_files import (
@@ -24,12 +22,11 @@ from beers_deploy.network_files import (
     require_known,
     warn_outside,
 )
-from beers_deploy.profiles.errors import ModelError, as_path, optional, reason_of, require_numbers
+from beers_deploy.profiles.errors import ModelError, as_path, require_numbers
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.shipped import BLIND, DEFAULT_TARGET
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.quant.domains import OPSET
 from beers_deploy.quant.encodings import CORE, board_model, read_core, vint8_model
 from beers_deploy.quant.graph import require_one_image
 from beers_deploy.quant.input_range import FROM_SAMPLES, KEY, Ranges, in_words
@@ -46,7 +43,6 @@ from beers_deploy.quant.onnx_file import (
 )
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.tiling.receptive_field import Tiling, geometry_of
-from beers_deploy.quant.untrusted import times
 from beers_deploy.results import Input, Table
 
 if TYPE_CHECKING:
@@ -372,49 +368,3 @@ def other_precision(network: Network) -> Network | None:
     if variant not in shipped_names():
         return None
     return Network.load(variant, sensor=SENSOR, int8=network.precision != "int8")
-
-
-def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
-    """Export a torch module to ONNX, for any number and size of images.
-
-    Args:
-        module: the torch.nn.Module. Its training mode is restored afterwards.
-        example: shape (N, C, H, W) of an input that the module accepts.
-
-    Returns:
-        The ONNX model, with the input `image` and the output `restored`.
-
-    Raises:
-        ModelError: `module` is not a torch module, or torch cannot export it.
-        MissingExtraError: torch is not installed.
-    """
-    if not hasattr(module, "state_dict"):
-        raise ModelError(
-            "`network` must be a Network, a ModelProto, a torch.nn.Module, a file or a shipped "
-            f"name, got {type(module).__name__}."
-        )
-    torch = optional("torch", "network")
-    free = {name: {0: "N", 2: "H", 3: "W"} for name in ("image", "restored")}
-    stream = io.BytesIO()
-    training = module.training
-    with warnings.catch_warnings():
-        # The exporter's own warnings do not count, because its file is checked below.
-        warnings.simplefilter("ignore")
-        try:
-            names = {"input_names": ["image"], "output_names": ["restored"], "dynamic_axes": free}
-            image = torch.zeros(tuple(example))
-            torch.onnx.export(
-                module.eval(), (image,), stream, opset_version=OPSET, dynamo=False, **names
-            )
-        # The code of a module may raise anything.
-        except Exception as error:
-            reason = reason_of(error)
-            raise ModelError(
-                f"torch cannot export the module {type(module).__name__}: {reason}. Check that it "
-                f"accepts an image of {times(example)}, or load it first with "
-                "Network.load(module, example=(N, C, H, W))."
-            ) from error
-        finally:
-            # `eval` changed the caller's own module.
-            module.train(training)
-    return read_onnx(stream.getvalue(), type(module).__name__)
