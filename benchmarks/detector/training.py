@@ -260,7 +260,7 @@ def turned(picture: Picture, generator: np.random.Generator) -> Picture:
 def judge(pictures: Sequence[Picture], file: Path) -> None:
     """Print the average precisions with intervals, on pictures that were not used for training."""
     truths = [Boxes.of(picture.corners, picture.classes) for picture in pictures]
-    detector = open_detector(file, 1)
+    detector = open_detector(file)
     detections = [
         detector.detect((picture.image.astype(np.float32) / 255).transpose(1, 2, 0))
         for picture in pictures

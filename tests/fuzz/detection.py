@@ -47,4 +47,4 @@ def detector_seeds(folder: Path) -> list[bytes]:
 
 
 def detect(path: Path) -> None:
-    open_detector(path, 1).detect(GREY.astype(np.float32) / 255)
+    open_detector(path).detect(GREY.astype(np.float32) / 255)

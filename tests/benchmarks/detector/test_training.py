@@ -82,7 +82,7 @@ def test_symmetries_move_the_boxes_with_the_image(seed: int) -> None:
 
 
 def test_the_stored_detector_states_our_classes_and_its_recipe() -> None:
-    detector = open_detector(DETECTOR, 1)
+    detector = open_detector(DETECTOR)
     assert (detector.names, detector.size_px, detector.flag) == (CLASSES, 256, "")
     assert metadata(load_onnx(DETECTOR))["recipe"] == str(DetectorRecipe())
 
@@ -90,7 +90,7 @@ def test_the_stored_detector_states_our_classes_and_its_recipe() -> None:
 @pytest.mark.slow
 def test_the_stored_detector_finds_most_unseen_objects() -> None:
     pictures = [drawn_picture(256, 7, number) for number in range(6)]
-    detector = open_detector(DETECTOR, 1)
+    detector = open_detector(DETECTOR)
     boxes = [
         detector.detect((picture.image.astype(np.float32) / 255).transpose(1, 2, 0))
         for picture in pictures
