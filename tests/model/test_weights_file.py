@@ -92,7 +92,7 @@ def test_a_header_that_does_not_fit_the_tensors_is_refused(variant: object, tmp_
 @pytest.mark.parametrize("kind", [np.float64, np.float16, np.int32])
 def test_weights_of_another_type_are_refused(kind: type, tmp_path: Path) -> None:
     tensors = arrays(plain(Variant(1, 4)).state_dict())
-    other = {name: value.astype(kind) for name, value in tensors.items()}
+    other: dict[str, np.ndarray] = {name: value.astype(kind) for name, value in tensors.items()}
     write_tensors(tmp_path / "w.safetensors", other, {"variant": {"blocks": 1, "features": 4}})
     refused(tmp_path / "w.safetensors", "not finite float32")
 
