@@ -9,7 +9,7 @@ import numpy as np
 
 from beers_deploy.quant.adapt.zero_padding import pads_of
 from beers_deploy.quant.graph.attention import shrinking
-from beers_deploy.quant.graph.deviation import deviation
+from beers_deploy.quant.graph.deviation import Deviation
 from beers_deploy.quant.graph.host_end import host_end
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
@@ -74,7 +74,7 @@ def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
         Kind.attention: shrinking(graph, node),
         Kind.silu: silu_input(graph, node),
         Kind.padding: pads_of(graph, node),
-        Kind.deviation: node.op_type in ("Pow", "Sqrt") and deviation(graph, node),
+        Kind.deviation: Deviation.of(graph, node),
         Kind.bilinear: resizing is not None and resizing.is_nearly_bilinear,
         Kind.cubic: alone_enlarges_image(graph, node),
     }
@@ -82,8 +82,7 @@ def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
         if is_of_kind:
             return kind
     if node.op_type in ("Sigmoid", "Tanh"):
-        (result,) = node.outputs
-        readers = graph.readers[result]
+        readers = graph.readers[node.result]
         part_of_silu = readers and all(silu_input(graph, reader) for reader in readers)
         return None if part_of_silu else Kind[node.op_type.lower()]
     if node.op_type == "HardSigmoid":
@@ -112,7 +111,7 @@ def silu_input(graph: OnnxGraph, node: Node) -> str:
         The name of x; "" if the node computes something else.
     """
     if node.op_type in ("Gelu", "Mish"):
-        return node.inputs[0]
+        return node.source
     if node.op_type == "Mul":
         for source, gate in (node.inputs, node.inputs[::-1]):
             gelu = gelu_gate_input(graph, gate)
@@ -129,11 +128,12 @@ def silu_input(graph: OnnxGraph, node: Node) -> str:
 
 def _is_gate(graph: OnnxGraph, node: Node, source: str) -> bool:
     """Return True if a node is Sigmoid(c x) or Tanh(Softplus(x)) of a tensor x."""
-    name = node.inputs[0]
-    before = graph.writers.get(name)
+    before = graph.writers.get(node.source)
     if node.op_type == "Tanh":
         return before is not None and before.op_type == "Softplus" and source in before.inputs
-    is_source = name == source or (before is not None and _by_constant(graph, before, source))
+    is_source = node.source == source or (
+        before is not None and _by_constant(graph, before, source)
+    )
     return node.op_type == "Sigmoid" and is_source
 
 
@@ -181,9 +181,9 @@ def nodes_by_kind(graph: OnnxGraph) -> dict[Kind, list[Node]]:
     on_host = host_end(graph).replaced
     for node in graph.nodes:
         kind = kind_of(graph, node)
-        if kind is not None and node.outputs[0] not in on_host:
+        if kind is not None and node.result not in on_host:
             nodes.setdefault(kind, []).append(node)
     # The host mirrors the image itself.
-    if all(node.inputs[0] in graph.inputs for node in nodes.get(Kind.padding, [])):
+    if all(node.source in graph.inputs for node in nodes.get(Kind.padding, [])):
         nodes.pop(Kind.padding, None)
     return nodes

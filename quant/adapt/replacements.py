@@ -42,7 +42,8 @@ from beers_deploy.quant.adapt.kinds import Kind, nodes_by_kind, silu_input, slop
 from beers_deploy.quant.adapt.zero_padding import pad_by_zeros
 from beers_deploy.quant.graph.attention import aligned
 from beers_deploy.quant.graph.base import REACH_PX, Base
-from beers_deploy.quant.graph.deviation import deviation
+from beers_deploy.quant.graph.deviation import Deviation
+from beers_deploy.quant.graph.host_end import host_end
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.resize import Resizing, enlarged_bilinearly
@@ -104,25 +105,23 @@ def _approximation(graph: OnnxGraph, node: Node, kind: Kind) -> list[Node]:
 
     Args:
         graph: the graph that the node belongs to.
-        node: the Mul of a SiLU or GELU, a Gelu, a Sigmoid, a Tanh, a LeakyReLU, a PReLU or a
-            Resize.
+        node: a node of that kind; of several that spell an operator, the last.
         kind: its kind.
     """
-    (output,) = node.outputs
     if kind is Kind.silu:
-        return [Node.new("HardSwish", [silu_input(graph, node)], output, node.name)]
+        return [node.replaced_by("HardSwish", [silu_input(graph, node)])]
     if kind is Kind.sigmoid:
-        return [Node.new("HardSigmoid", node.inputs, output, node.name, alpha=1 / 6, beta=0.5)]
+        return [node.replaced_by("HardSigmoid", node.inputs, alpha=1 / 6, beta=0.5)]
     if kind is Kind.tanh:
         return _clipped_line(graph, node)
     if kind is Kind.bilinear:
         factor = int(Resizing.of(node, graph).factors[2])
-        return enlarged_bilinearly(graph, node.inputs[0], factor, node)
-    if kind is Kind.deviation:
-        return deviation(graph, node)
+        return enlarged_bilinearly(graph, node.source, factor, node)
+    if deviation := Deviation.of(graph, node):
+        return deviation.nodes(graph)
     if kind is Kind.cubic:
         return _cubic_convolution(graph, node)
-    return [Node.new("LeakyRelu", node.inputs[:1], output, node.name, alpha=LEAKY_SLOPE)]
+    return [node.replaced_by("LeakyRelu", [node.source], alpha=LEAKY_SLOPE)]
 
 
 def _clipped_line(graph: OnnxGraph, node: Node) -> list[Node]:
@@ -147,13 +146,14 @@ def _clipped_line(graph: OnnxGraph, node: Node) -> list[Node]:
 def _cubic_convolution(graph: OnnxGraph, node: Node) -> list[Node]:
     """Return a transposed convolution of the mirrored image in place of a bicubic Resize.
 
-    The Resize remains where a sum reads it: the host computes that.
+    The Resize remains for a sum that the host computes.
     """
-    (image, *_) = node.inputs
-    (result,) = node.outputs
+    image = node.source
+    result = node.result
     convolved = f"{result}.convolved"
+    on_host = host_end(graph).replaced
     for reader in graph.readers[result]:
-        if reader.op_type != "Add":
+        if reader.result not in on_host:
             reader.inputs = tuple(convolved if name == result else name for name in reader.inputs)
     factor = int(Resizing.of(node, graph).factors[2])
     base = Base(factor=factor, mode="cubic")

@@ -12,7 +12,7 @@ from onnx import ModelProto
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph.attention import aligned, shrinking
-from beers_deploy.quant.graph.deviation import deviation
+from beers_deploy.quant.graph.deviation import Deviation
 from beers_deploy.quant.graph.host_end import host_end
 from beers_deploy.quant.graph.node_operations import ACTIVATIONS, READERS, read_activation, require
 from beers_deploy.quant.graph.operations import (
@@ -147,9 +147,9 @@ class _Reader:
             if shrinking(graph, node):
                 fault = f"{node} enlarges to the size of another map, by no whole factor."
                 plan.update(aligned(graph, node))
-            elif deviations := deviation(graph, node):
+            elif deviation := Deviation.of(graph, node):
                 fault = f"The DPU does not compute the standard deviation over the image, {node}."
-                plan[node] = deviations
+                plan[node] = deviation.nodes(graph)
         if not plan:
             return model
         graph.rewrite(lambda _, node: plan.get(node))

@@ -111,7 +111,7 @@ def enlarged_bilinearly(graph: OnnxGraph, source: str, factor: int, node: Node) 
         step = min(4, factor // enlarged)
         enlarged *= step
         is_last = enlarged == factor
-        result = node.outputs[0] if is_last else f"{node.outputs[0]}.{enlarged}"
+        result = node.result if is_last else f"{node.result}.{enlarged}"
         scales = graph.add_constant(f"{result}.scales", np.array([1, 1, step, step]))
         name = node.name if is_last else result
         nodes.append(Node.new("Resize", [source, "", scales], result, name, **modes))
@@ -143,6 +143,6 @@ def alone_enlarges_image(graph: OnnxGraph, node: Node) -> bool:
         graph: the graph that the node belongs to.
         node: any node.
     """
-    readers = graph.readers[node.inputs[0]]
+    readers = graph.readers[node.source]
     is_alone = all(reader is node or reader.op_type == "Add" for reader in readers)
     return is_alone and enlarges_image(graph, node)
