@@ -25,6 +25,7 @@ from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.shipped import BLIND, TILE_PX
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.encodings import save_config
+from beers_deploy.quant.onnx.image_input import fixed_tile_px
 from beers_deploy.quant.session import open_session, tensors_of
 from beers_deploy.tables.markup import markdown_text
 
@@ -52,7 +53,7 @@ class Board(TargetProfile):
         int8: NetworkLike,
         out: str | os.PathLike[str],
         *,
-        tile: int = TILE_PX,
+        tile: int | None = None,
         record: bool = False,
         sensor: SensorLike | None = None,
     ) -> Path:
@@ -74,7 +75,8 @@ class Board(TargetProfile):
         Args:
             int8: the network, quantised under this board's rules.
             out: the folder to write.
-            tile: side of a tile in pixels, the only image size that the cores accept.
+            tile: side of a tile in pixels, the only image size that the cores accept. None stands
+                for the size that the network is fixed to, or for 640.
             record: True to add a record of evidence: what the network is, and the result of
                 `check`.
             sensor: the sensor that acquires the images: a `Sensor`, a name or a .toml file. A
@@ -94,13 +96,13 @@ class Board(TargetProfile):
                 nor an NPU.
             ProfileError: there is no such sensor.
         """
-        tile = _require_tile(tile)
         device_of(self)
         folder = as_path(out)
         require_writable(folders=[folder])
         profile = None if sensor is None else Sensor.load(sensor)
         images_of = profile or Sensor.load(BLIND)
         network = to_run_on(Network.load(int8, sensor=images_of), images_of)
+        tile = _tile_px(tile, network)
         warning = other_sensor(network.model, images_of)
         if warning:
             logger.warning(warning)
@@ -146,8 +148,10 @@ class Board(TargetProfile):
         return folder
 
 
-def _require_tile(tile: int) -> int:
+def _tile_px(tile: int | None, network: Network) -> int:
     """Return the side of a tile, or raise OptionError if a core cannot have it."""
+    if tile is None:
+        tile = fixed_tile_px(network.model) or TILE_PX
     if not isinstance(tile, int | np.integer) or not 16 <= tile <= 8192:
         raise OptionError(
             f"`tile` must be a whole number of 16 to 8192 px, got {tile!r}. Choose another."

@@ -92,7 +92,8 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
 
     Returns:
         The constants by name, as host.json has them; None if the core does not read encoded pixels,
-        or if pixels are rearranged in another way than in `host.py`.
+        if pixels are rearranged in another way than in `host.py`, or if the network reads its whole
+        tile, so that `host.py` could not cut images.
 
     Raises:
         OptionError: a tile has no room between its halos.
@@ -100,7 +101,8 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
     core = read_core(network.model)
     part = core.host_part
     encoding = part.encoding.constants()
-    if encoding is None:
+    tiling = network.geometry
+    if encoding is None or tiling.reads_whole:
         return None
     blocks = {}
     for name, moves, channels in (
@@ -113,7 +115,6 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
         if not same_order or len(moves) > 1:
             return None
         blocks[name] = moves[0].block if moves else 1
-    tiling = network.tiling
     _require_room(tile_px, tiling)
     return {
         **blocks,

@@ -25,6 +25,7 @@ import math
 from dataclasses import dataclass
 from fractions import Fraction
 
+import numpy as np
 from onnx import ModelProto, TypeProto
 
 from beers_deploy.profiles.errors import ModelError
@@ -32,6 +33,7 @@ from beers_deploy.quant.graph.pixel_shuffle import MOVES, with_shuffles
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
 from beers_deploy.quant.onnx.image_input import fixed_tile_px
 from beers_deploy.quant.onnx_file import faults_named
+from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.tiling.axis_maps import AXIS_MAPS, AxisMap, AxisNode, not_tileable
 from beers_deploy.quant.untrusted import contradictions
 
@@ -131,22 +133,23 @@ def geometry_of(model: ModelProto, where: str = "") -> Tiling:
         where: the name of the network for messages.
 
     Raises:
-        ModelError: the network cannot be tiled, and is not fixed to the size of one tile and to
-            that of its result.
+        ModelError: the network cannot be tiled, and is not fixed to the size of one tile, or does
+            not make a square map of it.
     """
     try:
         return tiling_of(model, where)
     except ModelError as error:
         fixed_px = fixed_tile_px(model)
-        graph = OnnxGraph(model)
-        (name, *others) = graph.outputs
-        sizes = graph.result_sizes[name]
-        if fixed_px is None or others or len(sizes) != 4 or not sizes[2] or sizes[2] != sizes[3]:
+        if fixed_px is None or len(model.graph.output) != 1:
             raise
-        channels_in, channels_out = _channels(graph)
-        scale = Fraction(sizes[2], fixed_px)
-        reason = str(error)
-        return Tiling(fixed_px, 1, scale, channels_in, channels_out, fixed_px, reads_whole=reason)
+        channels_in, _ = _channels(OnnxGraph(model))
+        # Not every file states the size of its result.
+        image = np.zeros((1, channels_in, fixed_px, fixed_px), np.float32)
+        shape = result_of(open_session(model), image).shape
+        if len(shape) != 4 or shape[2] != shape[3]:
+            raise
+        scale = Fraction(shape[2], fixed_px)
+        return Tiling(fixed_px, 1, scale, channels_in, shape[1], fixed_px, reads_whole=str(error))
 
 
 def _channels(graph: OnnxGraph) -> tuple[int, int]:

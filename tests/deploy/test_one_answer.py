@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -273,8 +274,8 @@ def test_an_input_that_is_no_image_has_one_remedy(
             command()
 
 
-def test_quantize_notes_that_restore_refuses_the_network(tmp_path: Path) -> None:
-    """A network that pools over its whole image has integers, and no tiles of a larger image."""
+def test_quantize_notes_that_restore_leaves_seams(tmp_path: Path) -> None:
+    """A network that pools over its whole image has integers, and independent tiles alone."""
     w = Drawn(1)
     first = w.conv("image", CHANNELS, 1)
     gate = w.add("HardSigmoid", w.conv(w.add("GlobalAveragePool", first), CHANNELS, CHANNELS))
@@ -282,9 +283,14 @@ def test_quantize_notes_that_restore_refuses_the_network(tmp_path: Path) -> None
     last = w.conv(w.add("Mul", first, gate), 1, CHANNELS)
     int8 = quickly(fixed(w.save(tmp_path / "a.onnx", last), 32))
     assert int8.table is not None
-    assert any("`restore` does not run it" in note for note in int8.table.notes)
-    with pytest.raises(ModelError, match="cannot be tiled"):
-        bd.restore(SAMPLES[0, 0], network=int8, full_scale=1, progress=False, force=True, tile=32)
+    assert any("restores its tiles independently" in note for note in int8.table.notes)
+    restore = partial(bd.restore, network=int8, full_scale=1, tile=32, force=True, progress=False)
+    one_tile = SAMPLES[0, 0]
+    assert restore(one_tile).shape == one_tile.shape
+    larger = np.tile(one_tile, (1, 2))
+    with pytest.raises(OptionError, match=r"cannot be tiled.* give `halo` a number"):
+        restore(larger)
+    assert restore(larger, halo="4").shape == larger.shape
 
 
 def test_quantize_warns_of_what_the_board_refuses(

@@ -40,6 +40,7 @@ from tests.model.networks import behind_a_bank
 from tests.profiles.own_sensor import departing, edited, own_sensor
 from tests.quant.quick import patches_of, quickly
 from tests.quant.sensor_bank.test_filters import textured
+from tests.quant.simplify.networks import parsed
 from tests.quant.test_host_end import float_network
 
 BOARD = bd.Board.load("vck190")
@@ -108,6 +109,19 @@ def test_the_host_part_gives_the_host_files_bytes(name: str, tmp_path: Path) -> 
     dims = onnx.load(golden / "core.onnx").graph.input[0].type.tensor_type.shape.dim
     planes = np.load(golden / "noise" / "00-planes.npy")
     assert tuple(side.dim_value for side in dims[1:]) == planes.shape[1:]
+
+
+def test_a_network_that_reads_its_whole_tile_has_a_kit_of_its_size(tmp_path: Path) -> None:
+    """`host.py` could not cut images for it, so that the kit has none."""
+    model = parsed(
+        "p = GlobalAveragePool(x) h = HardSigmoid<alpha=0.16666667, beta=0.5>(p) y = Mul(x, h)",
+        "float[1,1,32,32] x => float[1,1,32,32] y",
+    )
+    samples = np.random.default_rng(0).random((4, 1, 32, 32), np.float32)
+    int8 = bd.quantize(model, samples=samples, effort="fast", progress=False)
+    folder = BOARD.kit(int8, tmp_path / "kit")
+    assert np.load(folder / "input.npy").shape[2:] == (32, 32)
+    assert not list(folder.glob("host.*"))
 
 
 OFFSET_DN = 60
