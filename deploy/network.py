@@ -42,7 +42,7 @@ from beers_deploy.quant.onnx_file import (
     with_one_output,
 )
 from beers_deploy.quant.session import open_session, result_of
-from beers_deploy.quant.tiling.receptive_field import Tiling, geometry_of
+from beers_deploy.quant.tiling.receptive_field import Tiling, independent_tiles, tiling_of
 from beers_deploy.results import Input, Table
 
 if TYPE_CHECKING:
@@ -291,7 +291,7 @@ class Network:
         """The precision, "float32" or "int8"."""
         return "int8" if is_quantized(self.model) else "float32"
 
-    @property
+    @cached_property
     def tiling(self) -> Tiling:
         """The geometry by which large images are cut into tiles for this network.
 
@@ -302,9 +302,7 @@ class Network:
             ModelError: the network cannot be tiled, for example because an operator reads the whole
                 image.
         """
-        if self.geometry.reads_whole:
-            raise ModelError(self.geometry.reads_whole)
-        return self.geometry
+        return tiling_of(self.model, self.label)
 
     @cached_property
     def geometry(self) -> Tiling:
@@ -314,7 +312,10 @@ class Network:
         Raises:
             ModelError: the network cannot be applied to tiles.
         """
-        return geometry_of(self.model, self.label)
+        try:
+            return self.tiling
+        except ModelError as error:
+            return independent_tiles(self.model, error)
 
     @property
     def sensor(self) -> str:

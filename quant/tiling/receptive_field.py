@@ -122,34 +122,29 @@ def tiling_of(model: ModelProto, where: str = "") -> Tiling:
         )
 
 
-def geometry_of(model: ModelProto, where: str = "") -> Tiling:
-    """Determine how an image may be cut into tiles, as `tiling_of` does, also for a network of
-    fixed size that reads its whole tile, such as by squeeze and excite.
-
-    Its tiles are restored independently: the radius is the tile.
+def independent_tiles(model: ModelProto, fault: ModelError) -> Tiling:
+    """Return the geometry of a network that cannot be tiled exactly, such as by squeeze and excite,
+    but is fixed to the size of one tile. Its tiles are restored independently: the radius is the
+    tile.
 
     Args:
         model: the network.
-        where: the name of the network for messages.
+        fault: why `tiling_of` refused it.
 
     Raises:
-        ModelError: the network cannot be tiled, and is not fixed to the size of one tile, or does
-            not make a square map of it.
+        ModelError: `fault`, if the network accepts any size, or makes no square map of its tile.
     """
-    try:
-        return tiling_of(model, where)
-    except ModelError as error:
-        fixed_px = fixed_tile_px(model)
-        if fixed_px is None or len(model.graph.output) != 1:
-            raise
-        channels_in, _ = _channels(OnnxGraph(model))
-        # Not every file states the size of its result.
-        image = np.zeros((1, channels_in, fixed_px, fixed_px), np.float32)
-        shape = result_of(open_session(model), image).shape
-        if len(shape) != 4 or shape[2] != shape[3]:
-            raise
-        scale = Fraction(shape[2], fixed_px)
-        return Tiling(fixed_px, 1, scale, channels_in, shape[1], fixed_px, reads_whole=str(error))
+    fixed_px = fixed_tile_px(model)
+    if fixed_px is None or len(model.graph.output) != 1:
+        raise fault
+    channels_in, _ = _channels(OnnxGraph(model))
+    # Not every file states the size of its result.
+    image = np.zeros((1, channels_in, fixed_px, fixed_px), np.float32)
+    shape = result_of(open_session(model), image).shape
+    if len(shape) != 4 or shape[2] != shape[3]:
+        raise fault
+    scale = Fraction(shape[2], fixed_px)
+    return Tiling(fixed_px, 1, scale, channels_in, shape[1], fixed_px, reads_whole=str(fault))
 
 
 def _channels(graph: OnnxGraph) -> tuple[int, int]:

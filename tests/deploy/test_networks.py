@@ -213,7 +213,7 @@ def test_a_run_parses_and_opens_a_network_once(
         monkeypatch.setattr(f"{module}.{name}", counting)
 
     counted("beers_deploy.quant.onnx_file", "parse_onnx")
-    counted("beers_deploy.network", "geometry_of")
+    counted("beers_deploy.network", "tiling_of")
     counted("onnxruntime", "InferenceSession")
     pixels = np.random.default_rng(0).integers(0, 4096, (61, 83)).astype(np.uint16)
     tifffile.imwrite(tmp_path / "in.tif", pixels)
@@ -222,7 +222,7 @@ def test_a_run_parses_and_opens_a_network_once(
         bd.restore(pixels, network=model, tile=23)
     else:
         bd.restore(tmp_path / "in.tif", tmp_path / "out.tif", network=model, tile=23)
-    assert counts == {"parse_onnx": 1, "geometry_of": 1, "InferenceSession": 1}
+    assert counts == {"parse_onnx": 1, "tiling_of": 1, "InferenceSession": 1}
 
 
 @pytest.mark.slow
