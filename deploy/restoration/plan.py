@@ -273,7 +273,7 @@ class Plan:
         """The halo in pixels as text, with a note if it is smaller than the receptive radius, so
         that seams between tiles are not exact.
         """
-        if self.halo_px >= self.radius_px or self.tiles == self.groups == 1:
+        if self.halo_px >= self.radius_px or len(self.rows) == len(self.columns) == 1:
             return f"{self.halo_px} px (exact)"
         if self.tiling.reads_whole:
             return f"{self.halo_px} px (seams: the network reads its whole tile)"

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import beers_deploy as bd
 from beers_deploy.profiles.errors import ModelError, OptionError
-from beers_deploy.quant.adapt.adaptation import ADAPTED, NEAR_DB, adapt
+from beers_deploy.quant.adapt.adaptation import ADAPTED, NEAR_DB, Adapted, adapt
 from beers_deploy.quant.adapt.compensation import Equations, compensated
 from beers_deploy.quant.adapt.kinds import EXACT, Kind, nodes_by_kind
 from beers_deploy.quant.adapt.replacements import replaced
@@ -250,6 +250,13 @@ def assert_same(model: onnx.ModelProto, other: onnx.ModelProto) -> None:
         expected = result_of(open_session(model), pixels)
         actual = result_of(open_session(other), pixels)
         np.testing.assert_allclose(actual, expected, rtol=1e-5, atol=2e-6)
+
+
+def assert_near(adapted: Adapted, least_db: float) -> None:
+    """Check the PSNR of an adapted network to the original one."""
+    near = adapted.rows[-1].figures[TO_ORIGINAL].value
+    assert near is not None
+    assert near > least_db
 
 
 def squared_error(model: onnx.ModelProto, other: onnx.ModelProto) -> float:
@@ -532,9 +539,7 @@ def test_spatial_attention_is_aligned_and_compensated(free: bool) -> None:
     assert [op.factor for op in graph if isinstance(op, Resize)] == [4, 2]
     strides = [node.attributes.get("strides") for node in OnnxGraph(adapted.model).nodes]
     assert [4, 4] in strides
-    near = adapted.rows[-1].figures[TO_ORIGINAL].value
-    assert near is not None
-    assert near > 40
+    assert_near(adapted, 40)
 
 
 @pytest.mark.parametrize("factor", [1, 4])
@@ -545,9 +550,7 @@ def test_a_standard_deviation_becomes_the_mean_absolute_deviation(factor: float)
         read_network(model)
     adapted = adapt(model, BARE, BARE)
     assert adapted.rows[0].name == "1 standard deviation over the image"
-    near = adapted.rows[-1].figures[TO_ORIGINAL].value
-    assert near is not None
-    assert near > 50
+    assert_near(adapted, 50)
     int8 = quickly(adapted.model, BARE)
     assert structure_checks(model, int8.host)[0].value == 0
 
@@ -583,9 +586,7 @@ def test_bilinear_enlargement_has_half_pixel_centres(where: str, factor: int) ->
         read_network(model)
     adapted = adapt(model, BARE, BARE)
     assert adapted.rows[0].name == "1 other bilinear enlargement"
-    near = adapted.rows[-1].figures[TO_ORIGINAL].value
-    assert near is not None
-    assert near > 30
+    assert_near(adapted, 30)
     resizes = [op for op in read_network(adapted.model).graph if isinstance(op, Resize)]
     assert all(op.bilinear for op in resizes)
     assert [op.factor for op in resizes] == ([4, 2] if factor == 8 else [factor])
