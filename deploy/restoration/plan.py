@@ -317,14 +317,16 @@ def plan_for(network: Network, shape: tuple[int, int, int], tiles: Tiles) -> Pla
             f"image at least as large, got {tiles.side_px} px and an image of {width_px} x "
             f"{height_px} pixels. Use a network with free sizes."
         )
-    halo_px = parse_halo(tiles.halo, tiling.halo_px)
-    if tiling.reads_whole and tiles.halo == "exact":
-        if shape[1:] != (tiling.fixed_px, tiling.fixed_px):
-            raise OptionError(
-                f"{tiling.reads_whole} To restore tiles independently, with seams between them, "
-                "give `halo` a number of pixels, such as 8."
-            )
+    is_one_tile = shape[1:] == (tiling.fixed_px, tiling.fixed_px)
+    if not tiling.reads_whole or tiles.halo.isdecimal():
+        halo_px = parse_halo(tiles.halo, tiling.halo_px)
+    elif tiles.halo == "exact" and is_one_tile:
         halo_px = 0
+    else:
+        raise OptionError(
+            f"{tiling.reads_whole} To restore tiles independently, with seams between them, "
+            "give `halo` a number of pixels, such as 8."
+        )
     return make_plan(shape, tiles.side_px, halo_px, tiling)
 
 

@@ -212,8 +212,9 @@ def test_tiles_of_a_network_that_reads_its_whole_tile_are_independent(tmp_path: 
     pixels = np.random.default_rng(3).integers(1, 4096, (70, 50)).astype(np.uint16)
     tile = pixels[:32, :32]
     assert_allclose(by_file(tile, tmp_path, path, 32), halved(tile), atol=1)
-    with pytest.raises(OptionError, match=r"pool reads the whole image.* give `halo`"):
-        by_file(pixels, tmp_path, path, 32)
+    for halo in ("exact", "x"):
+        with pytest.raises(OptionError, match=r"pool reads the whole image.* give `halo`"):
+            by_file(pixels, tmp_path, path, 32, halo=halo)
     result = by_file(pixels, tmp_path, path, 32, halo="4")
     assert_allclose(result[:28, :28], halved(tile)[:28, :28], atol=1)
     assert_allclose(result[52:, 28:], halved(pixels[38:, 18:])[14:, 10:], atol=1)
