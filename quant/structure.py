@@ -315,12 +315,12 @@ def structure_checks(
     int8_relus = count_relus(int8)
     if (core := _own_core(int8)) is not None:
         # `quant.adapt` computes LeakyReLUs and PReLUs by a ReLU in a second branch, and a Tanh by a
-        # ReLU6, and the root of a standard deviation by a ReLU. They are those of the float network
-        # less the LeakyReLUs of the integers, the Tanh of the host and those behind a Softplus,
-        # which are parts of Mish.
+        # ReLU6, the root of a standard deviation by a ReLU, and a division by it with another. They
+        # are those of the float network less the LeakyReLUs of the integers, the Tanh of the host
+        # and those behind a Softplus, which are parts of Mish.
         kinds = Counter(node.op_type for node in float_model.graph.node)
         float_relus += kinds["LeakyRelu"] + kinds["PRelu"] + kinds["Tanh"] - kinds["Softplus"]
-        float_relus += kinds["Pow"] + kinds["Sqrt"]
+        float_relus += kinds["Sqrt"] + kinds["Div"] + 2 * kinds["InstanceNormalization"]
         float_relus -= sum(
             isinstance(op, IntConv | Pointwise) and op.activation is Activation.leaky_relu
             for op in core.ops

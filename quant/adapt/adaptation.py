@@ -7,7 +7,7 @@
 """
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 
@@ -17,10 +17,12 @@ import onnx
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.figures import Figure, Row
 from beers_deploy.quant.adapt.compensation import compensated
+from beers_deploy.quant.adapt.inverse_deviation import fit_inverses
 from beers_deploy.quant.adapt.kinds import APPROXIMATIONS, EXACT, Kind, nodes_by_kind
 from beers_deploy.quant.adapt.replacements import replaced
 from beers_deploy.quant.gate import GateResult, compare, figure_of
 from beers_deploy.quant.graph import read_network
+from beers_deploy.quant.graph.normalization import InverseDeviation, Normalization
 from beers_deploy.quant.onnx.graph import OnnxGraph
 from beers_deploy.quant.onnx.image_input import fixed_tile_px
 from beers_deploy.quant.samples.patches import Patches
@@ -115,24 +117,29 @@ def adapt(model: onnx.ModelProto, samples: Patches, held_out: Patches) -> Adapte
     Raises:
         ModelError: the network has other operators that no DPU computes.
     """
-    counts = {kind: len(nodes) for kind, nodes in nodes_by_kind(OnnxGraph(model)).items()}
+    graph = OnnxGraph(model)
+    by_kind = nodes_by_kind(graph)
+    counts = {kind: len(nodes) for kind, nodes in by_kind.items()}
     if not counts:
         return Adapted(model)
     exact = {kind for kind in counts if kind not in APPROXIMATIONS}
     # Raises an error for operators that the DPU still lacks before the work of fitting.
-    read_network(replaced(model, counts.keys() - exact, exact))
+    read_network(replaced(model, counts.keys() - exact, exact, {}))
     images = _fit_images(model, samples.degraded)
+    ends = by_kind.get(Kind.normalization, ())
+    normalizations = [each for each in (Normalization.of(graph, node) for node in ends) if each]
+    inverses = fit_inverses(model, normalizations, images)
     # 1. and 2.
     trials = dict[Kind, Trial]()
     for kind in [kind for kind in counts if kind in APPROXIMATIONS]:
-        trials[kind] = _trial(model, {kind}, set(), images, held_out)
+        trials[kind] = _trial(model, {kind}, set(), images, held_out, inverses)
         if kind in EXACT and not trials[kind].is_enough:
             exact.add(kind)
     # 3. One kind alone has been tried as it is chosen.
     if len(counts) == 1 and not exact:
         (chosen,) = trials.values()
     else:
-        chosen = _trial(model, counts.keys() - exact, exact, images, held_out)
+        chosen = _trial(model, counts.keys() - exact, exact, images, held_out, inverses)
     rows = []
     for kind, count in counts.items():
         if kind in exact:
@@ -154,9 +161,10 @@ def _trial(
     exact: Collection[Kind],
     images: Sequence[np.ndarray],
     held_out: Patches,
+    inverses: Mapping[str, InverseDeviation],
 ) -> Trial:
     """Replace some kinds of operators by other functions and some exactly, and compensate."""
-    network = replaced(model, approximated, exact)
+    network = replaced(model, approximated, exact, inverses)
     session = open_any_size(model)
     before = compare(session, open_any_size(network), held_out)
     # Maps around a mirrored image are no longer those of the original.

@@ -158,7 +158,7 @@ def _targets(networks: Networks, nodes: Sequence[Node]) -> list[list[Target]]:
     generator = np.random.default_rng(0)
     unknowns = [int(np.prod(networks.weights(node)[0].shape[1:])) for node in nodes]
     outputs = [node.outputs[0] for node in nodes]
-    for maps in _values(networks.original, outputs, networks.images):
+    for maps in values_of(networks.original, outputs, networks.images):
         for target, values, count in zip(targets, maps, unknowns, strict=True):
             total = max(LEAST_ROWS, ROWS_OF_EACH_UNKNOWN * count)
             height, width = values.shape[2:]
@@ -176,7 +176,7 @@ def _scale_activations(networks: Networks, replaced: Sequence[Node]) -> dict[str
     if not names:
         return {}
     values = list[list[np.ndarray]]()
-    for maps in _values(networks.original, names, networks.images):
+    for maps in values_of(networks.original, names, networks.images):
         flat = [array[0].reshape(array.shape[1], -1) for array in maps]
         values.append([array[:, :: -(-array.shape[1] // VALUES)] for array in flat])
     columns = [np.concatenate(arrays, axis=1) for arrays in zip(*values, strict=True)]
@@ -245,7 +245,7 @@ def _fit(
     unknowns = int(np.prod(weight.shape[1:]))
     equations = Equations(groups, unknowns, len(weight) // groups)
     names = [node.inputs[0], node.outputs[0]]
-    adapted = _values(networks.adapted, names, networks.images)
+    adapted = values_of(networks.adapted, names, networks.images)
     for target, (source, result) in zip(targets, adapted, strict=True):
         expected = target.values if factors is None else target.values * factors
         equations.add(
@@ -337,7 +337,7 @@ def _windows(
     return padded[:, rows[:, :, None], columns[:, None, :]].swapaxes(0, 1)
 
 
-def _values(
+def values_of(
     model: onnx.ModelProto, names: Sequence[str], images: Sequence[np.ndarray]
 ) -> Iterator[list[np.ndarray]]:
     """Yield the named tensors for each image; only the nodes in front of them are run."""

@@ -9,8 +9,8 @@ import numpy as np
 
 from beers_deploy.quant.adapt.zero_padding import pads_of
 from beers_deploy.quant.graph.attention import shrinking
-from beers_deploy.quant.graph.deviation import Deviation
 from beers_deploy.quant.graph.host_end import host_end
+from beers_deploy.quant.graph.normalization import Normalization, lone_deviation
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.resize import Resizing, alone_enlarges_image
@@ -35,6 +35,7 @@ class Kind(StrEnum):
     bilinear = "other bilinear enlargement"
     cubic = "bicubic enlargement"
     deviation = "standard deviation over the image"
+    normalization = "normalization of pixels or channels"
 
 
 APPROXIMATIONS = {
@@ -48,8 +49,9 @@ APPROXIMATIONS = {
     Kind.bilinear: "bilinear by 4 and 2 with half-pixel centres",
     Kind.cubic: "a transposed convolution of the mirrored image",
     Kind.deviation: "the mean absolute deviation",
+    Kind.normalization: "lines through the inverse of a sum of absolute differences",
 }
-"""The other function that replaces each kind (1 to 3, and 6 to 10)."""
+"""The other function that replaces each kind (1 to 3, and 6 to 11)."""
 EXACT = {
     Kind.hard_sigmoid: "HardSigmoid of a scaled input",
     Kind.leaky_relu: "ReLU in a second branch, and an Add",
@@ -74,7 +76,8 @@ def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
         Kind.attention: shrinking(graph, node),
         Kind.silu: silu_input(graph, node),
         Kind.padding: pads_of(graph, node),
-        Kind.deviation: Deviation.of(graph, node),
+        Kind.deviation: lone_deviation(graph, node),
+        Kind.normalization: Normalization.of(graph, node),
         Kind.bilinear: resizing is not None and resizing.is_nearly_bilinear,
         Kind.cubic: alone_enlarges_image(graph, node),
     }

@@ -27,12 +27,14 @@ And by another function again:
    the original repeats the border of the image, the host mirrors it.
 10. The standard deviation over the image, in IMDN's attention, becomes the mean absolute deviation
     (`quant.graph.deviation`).
+11. A normalisation of each pixel over its channels, or of each channel over the image, divides by
+    lines through sums of absolute differences (`quant.graph.normalization`).
 
 ELU, SELU and Softplus stay: lines that bend twice, by two ReLUs, lose 0.4 to 0.8 dB of U-Nets even
 if the convolutions behind are fitted.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from copy import deepcopy
 
 import numpy as np
@@ -42,8 +44,12 @@ from beers_deploy.quant.adapt.kinds import Kind, nodes_by_kind, silu_input, slop
 from beers_deploy.quant.adapt.zero_padding import pad_by_zeros
 from beers_deploy.quant.graph.attention import aligned
 from beers_deploy.quant.graph.base import REACH_PX, Base
-from beers_deploy.quant.graph.deviation import Deviation
 from beers_deploy.quant.graph.host_end import host_end
+from beers_deploy.quant.graph.normalization import (
+    InverseDeviation,
+    Normalization,
+    lone_deviation,
+)
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.resize import Resizing, enlarged_bilinearly
@@ -60,7 +66,10 @@ TANH_SLOPE = 0.8
 
 
 def replaced(
-    model: onnx.ModelProto, approximated: Collection[Kind], exact: Collection[Kind]
+    model: onnx.ModelProto,
+    approximated: Collection[Kind],
+    exact: Collection[Kind],
+    inverses: Mapping[str, InverseDeviation],
 ) -> onnx.ModelProto:
     """Return a copy of a network in which operators of some kinds are replaced by ones that a DPU
     computes.
@@ -73,6 +82,8 @@ def replaced(
         approximated: the kinds that are replaced by another function, which is near the original.
         exact: the kinds that are replaced by several operators with the same result. A kind in both
             is approximated.
+        inverses: the inverse deviation of each normalisation by the name of its result; one that is
+            missing gets numbers without a meaning.
     """
     network = deepcopy(model)
     graph = OnnxGraph(network)
@@ -83,7 +94,7 @@ def replaced(
             for node in nodes:
                 plan |= aligned(graph, node)
         elif kind in approximated and kind is not Kind.padding:
-            plan |= {node: _approximation(graph, node, kind) for node in nodes}
+            plan |= {node: _approximation(graph, node, kind, inverses) for node in nodes}
         elif kind in exact and kind is Kind.hard_sigmoid:
             plan |= {node: _scaled_hard_sigmoid(graph, node) for node in nodes}
         elif kind in exact:
@@ -100,13 +111,16 @@ def replaced(
     return network
 
 
-def _approximation(graph: OnnxGraph, node: Node, kind: Kind) -> list[Node]:
+def _approximation(
+    graph: OnnxGraph, node: Node, kind: Kind, inverses: Mapping[str, InverseDeviation]
+) -> list[Node]:
     """Return the nodes of another function that replaces an operator.
 
     Args:
         graph: the graph that the node belongs to.
         node: a node of that kind; of several that spell an operator, the last.
         kind: its kind.
+        inverses: the inverse deviations of normalisations.
     """
     if kind is Kind.silu:
         return [node.replaced_by("HardSwish", [silu_input(graph, node)])]
@@ -117,7 +131,9 @@ def _approximation(graph: OnnxGraph, node: Node, kind: Kind) -> list[Node]:
     if kind is Kind.bilinear:
         factor = int(Resizing.of(node, graph).factors[2])
         return enlarged_bilinearly(graph, node.source, factor, node)
-    if deviation := Deviation.of(graph, node):
+    if normalization := Normalization.of(graph, node):
+        return normalization.nodes(graph, inverses.get(node.result))
+    if deviation := lone_deviation(graph, node):
         return deviation.nodes(graph)
     if kind is Kind.cubic:
         return _cubic_convolution(graph, node)

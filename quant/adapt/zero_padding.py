@@ -8,6 +8,7 @@
 import numpy as np
 import onnx
 
+from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 
@@ -40,14 +41,21 @@ def pad_by_zeros(model: onnx.ModelProto) -> None:
         model: a simplified float network whose result has the size of its image, or a multiple.
 
     Raises:
-        ModelError: the network cannot be tiled.
+        ModelError: the network computes with its whole image.
     """
     graph = OnnxGraph(model)
     # 1.
     graph.rewrite(_padded)
     graph.save()
     # 2.
-    tiling = tiling_of(model)
+    try:
+        tiling = tiling_of(model)
+    except ModelError as error:
+        raise ModelError(
+            "Reflecting padding is replaced by zeros around the mirrored image, but this network "
+            "computes with its whole image, to which the border would belong. Pad by zeros, and "
+            "train it again."
+        ) from error
     border_px = -(-MIRRORED_PX // tiling.alignment_px) * tiling.alignment_px
     crop_px = int(border_px * tiling.scale)
     (image,) = graph.inputs

@@ -8,7 +8,8 @@ on.
 - `writer`: back to float ONNX;
 - `host_end`: what the host computes behind the core, such as an activation, and the `base` that
   a result is added to;
-- `attention` and `deviation`: replace attention that a DPU lacks, for reader and `quant.adapt`;
+- `attention`, `deviation` and `normalization`: replace what a DPU lacks, for reader and
+  `quant.adapt`;
 - `pixel_shuffle`, `quantized`: what checker and tiling read from a file as well.
 """
 

@@ -1,5 +1,7 @@
-"""Replace the standard deviation over an image, which IMDN's attention (CCA) has, by the mean
-absolute deviation, because a DPU computes no root.
+"""Recognise standard deviations, of each channel over the image or of each pixel over its channels.
+
+A DPU computes no root. The deviation over the image, which IMDN's attention (CCA) has, is replaced
+by the mean absolute deviation:
 
     sqrt(mean((x - m)^2)) is about RATIO mean(|x - m|) = 2 RATIO mean(ReLU(x - m))
 
@@ -12,29 +14,35 @@ from dataclasses import dataclass
 import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
-from beers_deploy.quant.simplify.fold_affine import affine_chain
+from beers_deploy.quant.simplify.fold_affine import Affine, affine_chain
 
+OVER_CHANNELS = (1,)
+OVER_IMAGE = (2, 3)
 RATIO = (np.pi / 2) ** 0.5
 """The standard deviation over the mean absolute deviation, of normally distributed values."""
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """A standard deviation over a square image of known size.
+    """A standard deviation over a square image, or over the channels of each pixel.
 
     Attributes:
         root: the node that computes it from the variance.
         source: the name of the map x.
         negative: the name of the mean of x, times -1.
-        side_px: the sides of x.
+        is_of_pixels: True for a deviation over the channels.
+        side_px: the sides of x; 0 if they are not known.
         scale: (C,) or (1,) the factor of the variance.
+        epsilon: what is added to the variance.
     """
 
     root: Node
     source: str
     negative: str
+    is_of_pixels: bool
     side_px: int
     scale: np.ndarray
+    epsilon: float
 
     @classmethod
     def of(cls, graph: OnnxGraph, node: Node) -> "Deviation | None":
@@ -44,27 +52,22 @@ class Deviation:
             graph: the graph that the node belongs to, which knows the sizes of its tensors.
             node: any node; only a root can end one.
         """
-        exponent = graph.value(node, 1) if node.op_type == "Pow" else None
-        is_root = node.op_type == "Sqrt" or (exponent is not None and exponent.tolist() == 0.5)
-        scale, name = _scaled(graph, node.source if is_root else "")
+        name, affine = scaled(graph, node.source if node.op_type == "Sqrt" else "")
         variance = graph.writers.get(name)
-        square = graph.writers.get(variance.source) if variance is not None else None
-        if variance is None or variance.op_type != "GlobalAveragePool" or square is None:
+        axes = _axes_of_mean(graph, variance)
+        square = graph.writers.get(variance.source) if variance is not None and axes else None
+        if square is None or square.op_type != "Mul" or len(set(square.inputs)) > 1:
             return None
-        difference = graph.writers.get(square.source)
-        if square.op_type != "Mul" or len(set(square.inputs)) > 1 or difference is None:
+        match = less_mean(graph, square.source)
+        if match is None or match.axes != axes:
             return None
-        for source, negative in (difference.inputs, difference.inputs[::-1]):
-            mean, affine = affine_chain(graph, negative, is_sole=False)
-            pool = graph.writers.get(mean)
-            is_mean = (
-                pool is not None and pool.op_type == "GlobalAveragePool" and source in pool.inputs
-            )
-            is_negative = (affine.scale == -1).all() and not affine.shift.any()
-            *_, rows, columns = graph.shapes.get(source, (0, 0))
-            if is_mean and is_negative and rows == columns:
-                return cls(node, source, negative, rows, scale)
-        return None
+        *_, rows, columns = graph.shapes.get(match.source, (0, 0))
+        is_of_pixels = axes == OVER_CHANNELS
+        if rows != columns and not is_of_pixels:
+            return None
+        scale = affine.scale
+        epsilon = float(affine.shift.max())
+        return cls(node, match.source, match.negative, is_of_pixels, rows, scale, epsilon)
 
     def nodes(self, graph: OnnxGraph) -> list[Node]:
         """Return the nodes that compute the mean absolute deviation in place of the root.
@@ -87,14 +90,67 @@ class Deviation:
         ]
 
 
-def _scaled(graph: OnnxGraph, name: str) -> tuple[np.ndarray, str]:
-    """Return the factor (C,) or (1,) that constants scale a tensor by, and the tensor.
+@dataclass(frozen=True)
+class LessMean:
+    """A map less its mean.
 
-    What they add, against a root of 0, is left out.
+    Attributes:
+        source: the name of the map.
+        negative: the name of its mean, times -1.
+        axes: OVER_IMAGE or OVER_CHANNELS.
     """
-    name, affine = affine_chain(graph, name)
+
+    source: str
+    negative: str
+    axes: tuple[int, ...]
+
+
+def less_mean(graph: OnnxGraph, name: str) -> LessMean | None:
+    """Return what a tensor is computed of if it is a map less its mean; None if it is not.
+
+    Args:
+        graph: the graph of the tensor.
+        name: the name of the tensor.
+    """
+    difference = graph.writers.get(name)
+    if difference is None or difference.op_type != "Add":
+        return None
+    for source, negative in (difference.inputs, difference.inputs[::-1]):
+        mean_name, affine = scaled(graph, negative, is_sole=False)
+        mean = graph.writers.get(mean_name)
+        axes = _axes_of_mean(graph, mean)
+        is_negative = (affine.scale == -1).all() and not affine.shift.any()
+        if mean is not None and axes and is_negative and mean.source == source:
+            return LessMean(source, negative, axes)
+    return None
+
+
+def _axes_of_mean(graph: OnnxGraph, node: Node | None) -> tuple[int, ...]:
+    """Return the axes that a node takes the mean over, if it keeps them: OVER_IMAGE or
+    OVER_CHANNELS; none for anything else.
+    """
+    if node is None or node.op_type not in ("GlobalAveragePool", "ReduceMean"):
+        return ()
+    if node.op_type == "GlobalAveragePool":
+        return OVER_IMAGE
+    axes = tuple(axis % 4 for axis in graph.numbers(node, 1, "axes") or ())
+    return axes if axes == OVER_CHANNELS and node.attributes.get("keepdims", 1) else ()
+
+
+def scaled(graph: OnnxGraph, name: str, is_sole: bool = True) -> tuple[str, Affine]:
+    """Return the tensor that constants scale and shift to another, and what they do together.
+
+    Args:
+        graph: the graph.
+        name: the name of the other tensor.
+        is_sole: True to follow only tensors that nothing else reads.
+    """
+    name, affine = affine_chain(graph, name, is_sole)
     node = graph.writers.get(name)
     weight = graph.value(node, 1) if node is not None and node.op_type == "Conv" else None
+    # A convolution of one pixel that scales each channel, or repeats one.
     if node is None or weight is None or weight.shape[1:] != (1, 1, 1):
-        return affine.scale, name
-    return affine.scale * weight.ravel(), node.source
+        return name, affine
+    bias = graph.value(node, 2)
+    shift = affine.shift if bias is None else affine.scale * bias + affine.shift
+    return node.source, Affine(affine.scale * weight.ravel(), shift)

@@ -12,9 +12,9 @@ from onnx import ModelProto
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph.attention import aligned, shrinking
-from beers_deploy.quant.graph.deviation import Deviation
 from beers_deploy.quant.graph.host_end import host_end
 from beers_deploy.quant.graph.node_operations import ACTIVATIONS, READERS, read_activation, require
+from beers_deploy.quant.graph.normalization import Normalization, lone_deviation
 from beers_deploy.quant.graph.operations import (
     CORRECTION,
     IMAGE,
@@ -147,7 +147,10 @@ class _Reader:
             if shrinking(graph, node):
                 fault = f"{node} enlarges to the size of another map, by no whole factor."
                 plan.update(aligned(graph, node))
-            elif deviation := Deviation.of(graph, node):
+            elif normalization := Normalization.of(graph, node):
+                fault = f"The DPU does not compute the normalization {node}."
+                plan[node] = normalization.nodes(graph)
+            elif deviation := lone_deviation(graph, node):
                 fault = f"The DPU does not compute the standard deviation over the image, {node}."
                 plan[node] = deviation.nodes(graph)
         if not plan:

@@ -22,7 +22,7 @@ from onnx import (
     shape_inference,
 )
 
-from beers_deploy.quant.domains import Functions, functions_of, operator_name
+from beers_deploy.quant.domains import Functions, functions_of, operator_name, opset_of
 from beers_deploy.quant.onnx.window import Pair, Window
 
 WEIGHTS = {"Conv": 1, "ConvInteger": 1, "ConvTranspose": 1, "QLinearConv": 3}
@@ -182,10 +182,12 @@ class OnnxGraph:
         readers: for each tensor the nodes that read it. A node that reads it twice is listed twice.
         writers: for each tensor the node that writes it.
         shapes: the sizes of tensors by name, 0 for an unknown size; empty until they are inferred.
+        opset: the version of ONNX's operators that the model states.
     """
 
     def __init__(self, model: ModelProto) -> None:
         self._model = model
+        self.opset = opset_of(model)
         self.shapes: dict[str, tuple[int, ...]] = {}
         functions = functions_of(model)
         self.constants = constants(model)

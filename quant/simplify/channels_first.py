@@ -4,8 +4,8 @@ Exporters from TensorFlow transpose the image in front of the first convolution,
 the end. Linear layers of torch stand between two such nodes.
 
 1. A Transpose to channels last is moved behind operations on each value, concats, padding, means,
-   and products with a matrix, which become convolutions of one pixel. One to channels first then
-   undoes it.
+   and products with a matrix, which become convolutions of one pixel. A LayerNormalization over the
+   channels is spelled out for that. A Transpose to channels first then undoes it.
 2. If the image has its channels last, it is treated as one of channels first that is transposed
    before anything else. The result is treated likewise.
 """
@@ -20,6 +20,8 @@ from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 
 TO_FIRST = [0, 3, 1, 2]
 TO_LAST = [0, 2, 3, 1]
+AXES_ARE_INPUT = 18
+"""The opset from which on operators read axes as an input."""
 ON_VALUES = {
     *("Abs", "Add", "Cast", "Clip", "Div", "Dropout", "Elu", "Erf", "Exp", "Gelu", "HardSigmoid"),
     *("HardSwish", "Identity", "LeakyRelu", "Log", "Max", "Min", "Mul", "Neg", "PRelu", "Pow"),
@@ -84,10 +86,14 @@ def _moved_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
     if _is_transpose(node, TO_FIRST):
         return [node.replaced_by("Identity", [*sources.values()])]
     first = f"{result}.first"
-    moved = _on_first(graph, node, sources, first)
-    if moved is None:
+    if node.op_type == "LayerNormalization":
+        moved = _layer_normalization(graph, node, sources[node.source], first)
+    else:
+        on_first = _on_first(graph, node, sources, first)
+        moved = [] if on_first is None else [on_first]
+    if not moved:
         return None
-    return [moved, Node.new("Transpose", [first], result, f"{result}.last", perm=TO_LAST)]
+    return [*moved, Node.new("Transpose", [first], result, f"{result}.last", perm=TO_LAST)]
 
 
 def _on_first(graph: OnnxGraph, node: Node, sources: Mapping[str, str], first: str) -> Node | None:
@@ -129,6 +135,44 @@ def _on_first(graph: OnnxGraph, node: Node, sources: Mapping[str, str], first: s
         attributes["axis"] = TO_LAST[attributes["axis"] % 4]
     inputs = [sources.get(name) or _of_first(graph, name) for name in node.inputs]
     return Node.new(kind, inputs, first, node.name, **attributes)
+
+
+def _layer_normalization(graph: OnnxGraph, node: Node, source: str, first: str) -> list[Node]:
+    """Return the operators of a normalisation over the channels of a map that has these first; none
+    if it is one over other axes.
+
+    Args:
+        graph: the graph that the node belongs to; its constants are extended.
+        node: a LayerNormalization of the map with its channels last.
+        source: the name of the map with its channels first.
+        first: the name of the result.
+    """
+    if node.attributes.get("axis", -1) not in (-1, 3):
+        return []
+    scale_name, shift_name = (*node.inputs[1:], "")[:2]
+    scale = _of_first(graph, scale_name)
+    shift = _of_first(graph, shift_name or graph.add_constant(f"{first}.shift", np.zeros(1)))
+    names = ("mean", "difference", "square", "variance", "sum", "root", "quotient", "product")
+    mean, difference, square, variance, total, root, quotient, product = (
+        f"{first}.{name}" for name in names
+    )
+    axes = []
+    attributes = {"axes": [1]}
+    if graph.opset >= AXES_ARE_INPUT:
+        axes.append(graph.add_constant(f"{first}.axes", np.array([1]), np.int64))
+        attributes = {}
+    epsilon = np.array(node.attributes.get("epsilon", 1e-5))
+    return [
+        Node.new("ReduceMean", [source, *axes], mean, **attributes),
+        Node.new("Sub", [source, mean], difference),
+        Node.new("Mul", [difference, difference], square),
+        Node.new("ReduceMean", [square, *axes], variance, **attributes),
+        Node.new("Add", [variance, graph.add_constant(f"{first}.epsilon", epsilon)], total),
+        Node.new("Sqrt", [total], root),
+        Node.new("Div", [difference, root], quotient),
+        Node.new("Mul", [quotient, scale], product),
+        Node.new("Add", [product, shift], first, node.name),
+    ]
 
 
 def _of_first(graph: OnnxGraph, name: str) -> str:

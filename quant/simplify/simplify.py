@@ -82,10 +82,10 @@ from beers_deploy.quant.simplify.standard_operators import (
     drop_cast,
     drop_where,
     float_shapes,
-    multiply_squares,
     pool_maximum,
     pool_mean,
     pool_sums,
+    replace_powers,
     shrink_by_convolution,
     split_soft_threshold,
     split_sums,
@@ -170,7 +170,7 @@ def _run_passes(model: ModelProto) -> None:
         clip_last,
         split_soft_threshold,
         choose_by_relu,
-        multiply_squares,
+        replace_powers,
         drop_where,
     ):
         graph.rewrite(replacement)

@@ -114,20 +114,21 @@ def choose_by_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
     ]
 
 
-def multiply_squares(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace the square of a map by its product with itself.
+def replace_powers(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace the square of a map by its product with itself, and a power of 0.5 by the root.
 
     Args:
         graph: the graph that the node belongs to.
         node: any node.
 
     Returns:
-        The product; None if the node is no power of 2.
+        The product or the root; None if the node is neither power.
     """
     exponent = graph.value(node, 1) if node.op_type == "Pow" else None
-    if exponent is None or exponent.size != 1 or exponent.item() != 2:
-        return None
-    return [node.replaced_by("Mul", [node.source] * 2)]
+    power = exponent.item() if exponent is not None and exponent.size == 1 else None
+    if power == 2:
+        return [node.replaced_by("Mul", [node.source] * 2)]
+    return [node.replaced_by("Sqrt", [node.source])] if power == 0.5 else None
 
 
 def drop_where(graph: OnnxGraph, node: Node) -> list[Node] | None:

@@ -292,6 +292,10 @@ def _require_pointwise(at: AxisNode) -> None:
         table, order = (len(at.shapes.get(name, ())) for name in at.node.inputs)
         is_order = (table, order, at.attribute("axis", 0)) == (0, 1, 1)
         at.require(is_order or (table, at.attribute("axis", 0)) == (1, 0), "moves pixels")
+    elif kind.startswith("Reduce"):
+        axes = {axis % 4 for axis in at.numbers(1, "axes")}
+        is_of_channels = axes == {1} and at.attribute("keepdims", 1)
+        at.require(is_of_channels, "reads the whole image")
     else:
         why = next(
             (why for why, marks in WHY.items() if any(mark in kind for mark in marks)),
@@ -367,7 +371,7 @@ and the axis if none is stated.
 KEEPING = {"BatchNormalization", "Cast", "DequantizeLinear", "Identity", "QuantizeLinear"}
 """Operators that do not change the shape of constants."""
 WHY = {
-    "reads the whole image": ("Dynamic", "Global", "Normalization", "Reduce", "Shape"),
+    "reads the whole image": ("Dynamic", "Global", "Normalization", "Shape"),
     "is fully connected": ("Flatten", "Gemm", "MatMul"),
     "moves pixels": tuple(MOVES),
 }

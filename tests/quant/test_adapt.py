@@ -284,7 +284,7 @@ def test_leaky_relu_and_prelu_are_two_branches_and_an_add_exactly(act: Act) -> N
     """
     model = network(act)
     kinds = nodes_by_kind(OnnxGraph(model)).keys()
-    exact = replaced(model, (), kinds & EXACT.keys())
+    exact = replaced(model, (), kinds & EXACT.keys(), {})
     read_network(exact)
     assert_same(model, exact)
 
@@ -299,7 +299,7 @@ def test_hard_sigmoid_of_any_slope_becomes_one_of_a_sixth_exactly(
     The slope of a sixth is the one that a DPU computes.
     """
     model = network(hard_sigmoid(slope, offset))
-    exact = replaced(model, (), {Kind.hard_sigmoid})
+    exact = replaced(model, (), {Kind.hard_sigmoid}, {})
     read_network(exact)
     assert_same(model, exact)
 
@@ -310,7 +310,7 @@ def test_one_slope_for_all_channels_and_a_twin_of_each_convolution() -> None:
     Its second branch repeats the convolution in front of it, or reads through depthwise ones.
     """
     model = network(prelu(0.3))
-    exact = replaced(model, (), {Kind.prelu})
+    exact = replaced(model, (), {Kind.prelu}, {})
     graph = read_network(exact).graph
     # Behind the sum there is no convolution to repeat, so two depthwise ones stand there.
     assert sum(op.name.endswith(".bent") for op in graph) == 2
@@ -343,7 +343,7 @@ def test_compensation_comes_nearer_to_the_original_and_keeps_the_rest(name: str)
     model = network(act)
     nodes = nodes_by_kind(OnnxGraph(model))
     assert {key: len(found) for key, found in nodes.items()} == {kind: count}
-    before = replaced(model, {kind}, ())
+    before = replaced(model, {kind}, (), {})
     outputs = [node.outputs[0] for node in nodes[kind]]
     after = compensated(model, before, outputs, SAMPLES.degraded)
     read_network(after)
@@ -506,7 +506,7 @@ def test_the_gate_counts_the_relus_of_an_adapted_network(
     model = network(act)
     # With scales of some hundreds, the curved part of HardSwish and HardSigmoid is one unit.
     change(model, "a.w", lambda weight: 1e4 * weight)
-    int8 = quickly(replaced(model, approximated, exact), BARE)
+    int8 = quickly(replaced(model, approximated, exact, {}), BARE)
 
     def relus_off(ops: Any) -> float:
         """Return the number of ReLUs that the gate finds lost or added."""
@@ -600,7 +600,7 @@ def test_bicubic_enlargement_is_a_convolution_of_the_mirrored_image(factor: int,
         read_network(model)
     kinds = nodes_by_kind(OnnxGraph(model))
     assert {kind: len(nodes) for kind, nodes in kinds.items()} == {Kind.cubic: 1}
-    near = replaced(model, {Kind.cubic}, ())
+    near = replaced(model, {Kind.cubic}, (), {})
     # As bright as the samples that INT8 is calibrated on.
     pixels = BARE.degraded[0][..., :20, :28]
     expected, actual = (result_of(open_session(network), pixels) for network in (model, near))
@@ -621,7 +621,7 @@ def test_finetuning_learns_from_the_original() -> None:
     The training that users ask for anyway then recovers the loss of a replacement.
     """
     model = network(silu)
-    near = replaced(model, {Kind.silu}, ())
+    near = replaced(model, {Kind.silu}, (), {})
     int8 = quickly(near, BARE)
     graph = read_planes(read_network(near).graph)
     errors = []

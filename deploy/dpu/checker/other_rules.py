@@ -79,10 +79,10 @@ INSTEAD = {
     ),
     "TopK": "leave it to the host: the DPU does not compare values across a map",
     "LayerNormalization": (
-        "train without normalisation, or with one that folds into the convolution"
+        "train with batch normalisation, or without; 'quantize --adapt' replaces it"
     ),
     "InstanceNormalization": (
-        "train without normalisation, or with one that folds into the convolution"
+        "train with batch normalisation, or without; 'quantize --adapt' replaces it"
     ),
     "BatchNormalization": "fold it into the convolution before it",
 }

@@ -68,6 +68,7 @@ EXACT = {
     "restored = MaxPool<kernel_shape=[5,5], pads=[2,2,2,2]>(image)": Tiling(2),
     "restored = AveragePool<kernel_shape=[3,3], pads=[1,1,1,1]>(image)": Tiling(1),
     "restored = Mul(image, gain)": Tiling(0),
+    "restored = ReduceMean<axes=[-3]>(image)": Tiling(0),
     'p = Pad<mode="edge">(image, around) restored = Conv(p, w7)': Tiling(3),
     # Mirrored padding needs as many pixels as it mirrors.
     """c = Conv<pads=[0,0,2,2]>(image, w3)
