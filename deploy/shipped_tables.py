@@ -12,7 +12,6 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import TABLES, constant_keys
 from beers_deploy.profiles.shipped import (
     board_names,
-    profile_path,
     scene_names,
     sensor_names,
     target_names,
@@ -104,38 +103,19 @@ def list_of_profiles() -> Table:
     return Table(rows=tuple(rows))
 
 
-def text_of_profile(name: str) -> str:
-    """Return the TOML text of a profile, which a user can save and edit as a profile of their own.
-
-    Args:
-        name: the name of a shipped sensor, scene or board, or a .toml file.
-
-    Raises:
-        OptionError: there is no profile of this name.
-    """
-    kind, _ = _profile(name)
-    return profile_path(kind, name).read_text(encoding="utf-8")
-
-
-def table_of_profile(name: str) -> Table:
-    """List every constant of a sensor, a scene or a board, with its status and its source.
+def kind_and_table(name: str) -> tuple[str, Table]:
+    """Return the kind of a profile, and a table of its constants. The file is tried as a sensor, a
+    scene and a target in turn.
 
     Args:
         name: the name of a shipped profile, or a .toml file.
 
     Returns:
-        A table with a row for each key of the file, whose texts are value, status and source.
+        The name of the folder of such profiles, and a table with a row for each key of the file,
+        whose texts are value, status and source.
 
     Raises:
         OptionError: there is no profile of this name.
-    """
-    _, table = _profile(name)
-    return table
-
-
-def _profile(name: str) -> tuple[str, Table]:
-    """Return the folder of a profile, and its table. It is tried as sensor, scene and target in
-    turn.
     """
     if _is(name, "sensors", sensor_names(), "mtf"):
         sensor = Sensor.load(name)

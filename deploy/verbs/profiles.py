@@ -26,9 +26,11 @@ def profiles(name: ProfileName | None = None, *, toml: bool = False) -> "Table |
         OptionError: no such profile.
         ProfileError: a file that is no profile.
     """
-    from beers_deploy.shipped_tables import list_of_profiles, table_of_profile, text_of_profile
+    from beers_deploy.profiles.shipped import profile_path
+    from beers_deploy.shipped_tables import kind_and_table, list_of_profiles
 
     if name is None:
         refuse_without("`name`", toml=toml)
         return list_of_profiles()
-    return text_of_profile(name) if toml else table_of_profile(name)
+    kind, table = kind_and_table(name)
+    return profile_path(kind, name).read_text(encoding="utf-8") if toml else table

@@ -18,7 +18,7 @@ from beers_deploy.profiles.response import MtfTable, PointSpread, centroid, pack
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_numbers import same_instrument
 from beers_deploy.profiles.validation import validated
-from beers_deploy.shipped_tables import table_of_profile
+from beers_deploy.shipped_tables import kind_and_table
 from tests.profiles.own_sensor import SHIPPED, own_sensor
 from tests.profiles.test_profile_files import refusal
 
@@ -76,7 +76,8 @@ along = {{value = {along}, status = "assumed", source = "no edge"}}"""
     for sensor in (profile, Sensor.load(profile.save(tmp_path / "saved.toml"))):
         assert [axis.source for axis in sensor.contrasts] == ["a lab", "no edge"]
         assert [axis.status for axis in sensor.contrasts] == ["measured", "assumed"]
-    texts = {row.name: row.text for row in table_of_profile(str(tmp_path / "saved.toml"))}
+    _, table = kind_and_table(str(tmp_path / "saved.toml"))
+    texts = {row.name: row.text for row in table}
     assert [texts[f"mtf.{axis}"]["source"] for axis in ("across", "along")] == ["a lab", "no edge"]
 
 
