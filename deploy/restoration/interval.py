@@ -127,11 +127,6 @@ def half_widths_of(work: Restoration, level: Level) -> tuple[HalfWidth, ...]:
     return by_band(sensors, raster, lambda s: interval.for_sensor(s.nominal(), full_scale, level))
 
 
-def interval_beside(out: Path) -> Path:
-    """Return the path of the half-widths of a restored image: NAME-interval.tif next to `out`."""
-    return out.with_name(f"{out.stem}-interval.tif")
-
-
 def write_half_widths(
     path: Path, widths: HalfWidths, level: Level, compression: Compression
 ) -> None:

@@ -47,6 +47,13 @@ class Output:
     interval: Level | None = None
     others: tuple[Path | None, ...] = ()
 
+    @property
+    def interval_path(self) -> Path | None:
+        """The path of the half-widths, next to that of the image; None if none are written."""
+        if self.interval is None:
+            return None
+        return self.path.with_name(f"{self.path.stem}-interval.tif")
+
 
 def require_tiff_name(path: Path) -> None:
     """Raise OptionError if the path of the restored image has no suffix of a TIFF, or if a sidecar

@@ -36,7 +36,6 @@ from beers_deploy.restoration.detectors.fix import faults_of, fixed
 from beers_deploy.restoration.interval import (
     HalfWidths,
     half_widths_of,
-    interval_beside,
     write_half_widths,
 )
 from beers_deploy.restoration.memory import FLOAT_BYTES, peak_memory
@@ -102,7 +101,7 @@ def restore_file(
         MachineError: the memory or the disk is too small, or the workers do not answer.
     """
     out = output.path
-    widths = None if output.interval is None else interval_beside(out)
+    widths = output.interval_path
     with ExitStack() as stack:
         stored = stack.enter_context(begun(image, output, reading))
         pipeline = load()

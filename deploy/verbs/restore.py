@@ -3,6 +3,7 @@
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -270,7 +271,6 @@ def _output(
     """
     from beers_deploy.model.io.lock import part_folder
     from beers_deploy.restoration.detectors.fault_list import found_list_path
-    from beers_deploy.restoration.interval import interval_beside
     from beers_deploy.restoration.output import Output, require_tiff_name
     from beers_deploy.restoration.stac import network_paths
 
@@ -280,7 +280,7 @@ def _output(
         )
     path = Path(out)
     require_tiff_name(path)
-    widths = None if how["interval"] is None else interval_beside(path)
+    output = Output(path, **how)
     named = [path_or_none(document) for document in documents]
     if named[0] is not None:
         optional("pystac", "stac")
@@ -288,14 +288,14 @@ def _output(
         named += [item, item.with_suffix(".onnx")]
     # The list of faults is an output of its own where they are searched for.
     listed = found_list_path(path, fix_detectors)
-    others = (*named, listed, how["self_check"], widths)
-    may_exist = overwrite or (how["resume"] and part_folder(path).exists())
+    others = (*named, listed, output.self_check, output.interval_path)
+    may_exist = overwrite or (output.resume and part_folder(path).exists())
     for each in (path, *others):
         if each is not None and each.exists() and not may_exist:
             raise OptionError(
                 f"{each} exists already. Add `overwrite` to replace it, or choose another name."
             )
-    return Output(path, others=others, **how)
+    return replace(output, others=others)
 
 
 def _write_documents(
@@ -308,12 +308,10 @@ def _write_documents(
 ) -> None:
     """Write the STAC item and the view of a run, where they are asked for."""
     from beers_deploy.report.view import write_view
-    from beers_deploy.restoration.interval import interval_beside
     from beers_deploy.restoration.stac import write_item
 
     # Rasters over the same place as the output, by the name of their layer and asset.
-    widths = None if output.interval is None else interval_beside(output.path)
-    written = {"self-check": output.self_check, "interval": widths}
+    written = {"self-check": output.self_check, "interval": output.interval_path}
     maps = {name: raster for name, raster in written.items() if raster is not None}
     if stac is not None:
         write_item(run, Path(stac), maps)

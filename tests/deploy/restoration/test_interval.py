@@ -20,7 +20,7 @@ from beers_deploy.network_files import int8_for_sensor
 from beers_deploy.profiles.errors import MachineError, ModelError, OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import metadata
-from beers_deploy.restoration.interval import interval_beside, interval_of
+from beers_deploy.restoration.interval import interval_of
 from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import (
     NAME,
@@ -46,7 +46,7 @@ def run(image: Path, out: Path, **options: Any) -> bytes:
 
 def half_widths(out: Path) -> np.ndarray:
     """Return the planes of the file next to an output."""
-    with rasterio.open(interval_beside(out)) as file:
+    with rasterio.open(out.with_name(f"{out.stem}-interval.tif")) as file:
         return np.asarray(file.read())
 
 
