@@ -12,10 +12,11 @@ They and `stress` also judge a damaged file, which is not run elsewhere.
 from dataclasses import replace
 
 from beers_deploy.network import Network
-from beers_deploy.network_files import ConditionedFile, serves_every_sensor, warn_outside
+from beers_deploy.network_files import UNKNOWN_SENSORS, ConditionedFile, warn_outside
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND
-from beers_deploy.quant.encodings import require_undamaged
+from beers_deploy.quant.encodings import SENSOR_BIASES, require_undamaged
+from beers_deploy.quant.onnx_file import metadata
 
 
 def to_run_on(network: Network, sensor: Sensor) -> Network:
@@ -43,7 +44,9 @@ def conditioned_on(network: Network, sensor: Sensor) -> Network:
         The INT8 network of the sensor, with its exposures. Any other network is returned unchanged,
         as is a file that was already conditioned on a sensor, and each file for an unknown sensor.
     """
-    if sensor.name == BLIND or not serves_every_sensor(network.model):
+    about = metadata(network.model)
+    serves_every_sensor = SENSOR_BIASES in about and about.get("sensor", "") in UNKNOWN_SENSORS
+    if sensor.name == BLIND or not serves_every_sensor:
         return network
     file = ConditionedFile(network.name, network.model)
     warn_outside(sensor, file.kernels)

@@ -28,11 +28,10 @@ from beers_deploy.model.variants import Kernels
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND, BLIND_PROFILE
-from beers_deploy.profiles.toml import unreadable
-from beers_deploy.quant.encodings import SENSOR_BIASES, host_model, with_damage_of
+from beers_deploy.quant.encodings import host_model, with_damage_of
 from beers_deploy.quant.onnx.image_input import fixed_tile_px
 from beers_deploy.quant.onnx_file import load_onnx, metadata
-from beers_deploy.quant.sensor_bank.conditioned import required_conditioned_core, with_delta
+from beers_deploy.quant.sensor_bank.conditioned import required_conditioned_core
 
 logger = logging.getLogger(__name__)
 
@@ -194,12 +193,6 @@ def warn_outside(sensor: Sensor, kernels: Kernels) -> None:
             logger.warning(sentence)
 
 
-def serves_every_sensor(model: onnx.ModelProto) -> bool:
-    """Return True for an INT8 network that can be conditioned on any sensor, and is on none yet."""
-    about = metadata(model)
-    return SENSOR_BIASES in about and about.get("sensor", "") in UNKNOWN_SENSORS
-
-
 def other_sensor(model: onnx.ModelProto, sensor: Sensor) -> str:
     """Compare a network's recorded sensor with the one that acquires the images.
 
@@ -249,34 +242,4 @@ def int8_for_sensor(
         instrument.offset_dn / instrument.max_dn,
     )
     about = {**metadata(model), "sensor": sensor.name, **(more or {})}
-    return with_damage_of(model, host_model(core, about, fixed_tile_px(model)))
-
-
-def int8_for_delta(model: onnx.ModelProto, delta: Path) -> onnx.ModelProto:
-    """Condition an INT8 network on the sensor of a delta file.
-
-    A delta is a small file, written by `export --delta` to be sent to a satellite. It holds only
-    the data that depend on the sensor: the filters of the first layer, the biases, and the factor
-    from integers to pixel values.
-
-    Args:
-        model: the INT8 network that the delta belongs to.
-        delta: the delta file.
-
-    Returns:
-        A new ONNX model, which accepts the same image sizes as `model`.
-
-    Raises:
-        ModelError: the file cannot be read, is no delta, or belongs to another network; or `model`
-            cannot be conditioned on a sensor.
-    """
-    try:
-        packed = delta.read_bytes()
-    except OSError as error:
-        raise ModelError(
-            f"The delta {delta} cannot be read: {unreadable(delta) or error}. Give a file that "
-            "'export --delta' wrote."
-        ) from error
-    core, name = with_delta(required_conditioned_core(model).core, packed, str(delta))
-    about = {**metadata(model), "sensor": name}
     return with_damage_of(model, host_model(core, about, fixed_tile_px(model)))

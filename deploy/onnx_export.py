@@ -14,18 +14,26 @@ from beers_deploy.model.io.files import whole_file, write_text
 from beers_deploy.model.io.tensors import is_conditioned, read_conditioned, read_plain
 from beers_deploy.model.shipped import SENSOR, SHIPPED
 from beers_deploy.network import Network
-from beers_deploy.network_files import int8_for_delta, int8_for_sensor, warn_outside
+from beers_deploy.network_files import int8_for_sensor, warn_outside
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.target import TargetProfile
+from beers_deploy.profiles.toml import unreadable
 from beers_deploy.quant.c_code import c_program
-from beers_deploy.quant.encodings import host_model, read_core, require_undamaged, required_tile
+from beers_deploy.quant.encodings import (
+    host_model,
+    read_core,
+    require_undamaged,
+    required_tile,
+    with_damage_of,
+)
 from beers_deploy.quant.onnx.image_input import fixed_tile_px
 from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
 from beers_deploy.quant.sensor_bank.conditioned import (
     conditioned_core,
     delta_of_file,
     required_conditioned_core,
+    with_delta,
 )
 
 logger = logging.getLogger(__name__)
@@ -94,7 +102,16 @@ def conditioned_int8(path: Path, sensor: SensorLike | None, delta: Path | None) 
     """
     model = load_onnx(path)
     if delta is not None:
-        return int8_for_delta(model, delta)
+        try:
+            packed = delta.read_bytes()
+        except OSError as error:
+            raise ModelError(
+                f"The delta {delta} cannot be read: {unreadable(delta) or error}. Give a file that "
+                "'export --delta' wrote."
+            ) from error
+        core, name = with_delta(required_conditioned_core(model).core, packed, str(delta))
+        description = {**metadata(model), "sensor": name}
+        return with_damage_of(model, host_model(core, description, fixed_tile_px(model)))
     if sensor is None and conditioned_core(model) is None:
         return model
     profile = Sensor.load(sensor or SENSOR)

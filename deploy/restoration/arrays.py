@@ -64,7 +64,15 @@ def restore_array(
     else:
         results = _restore(image, reading, load, level)
         if np.ma.isMaskedArray(image):
-            results = [_masked_like(image, pixels) for pixels in results]
+            mask = np.ma.getmaskarray(image)
+            # Masked pixels stay masked, so the mask is enlarged with the image.
+            scale = results[0].shape[-1] // mask.shape[-1]
+            mask = mask.repeat(scale, axis=-2).repeat(scale, axis=-1)
+            # A network that makes other bands makes each of them of all bands of the image.
+            if mask.shape != results[0].shape:
+                planes = mask if mask.ndim == 2 else mask.any(axis=0)
+                mask = np.broadcast_to(planes, results[0].shape)
+            results = [np.ma.array(pixels, mask=mask) for pixels in results]
     return results[0] if level is None else tuple(results)
 
 
@@ -94,19 +102,6 @@ def _restore_labelled(
         _labelled(ordered, pixels) for pixels in _restore(ordered.data, reading, load, level)
     ]
     return [each if each.ndim != len(dims) else each.transpose(*dims) for each in labelled]
-
-
-def _masked_like(image: Any, restored: np.ndarray) -> Any:
-    """Return restored pixels as a masked array. Masked pixels of the image stay masked. The mask is
-    enlarged with the image.
-    """
-    mask = np.ma.getmaskarray(image)
-    scale = restored.shape[-1] // mask.shape[-1]
-    mask = mask.repeat(scale, axis=-2).repeat(scale, axis=-1)
-    # A network that makes other bands makes each of them of all bands of the image.
-    if mask.shape != restored.shape:
-        mask = np.broadcast_to(mask if mask.ndim == 2 else mask.any(axis=0), restored.shape)
-    return np.ma.array(restored, mask=mask)
 
 
 def _restore(

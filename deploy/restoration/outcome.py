@@ -155,21 +155,6 @@ class Tally:
             dark=int((before < DARK).sum()),
         )
 
-    def changed_from(self, network: "Tally", change_squared: float) -> "Tally":
-        """Return this tally, taken after the consistency step, with what a tally before it counted.
-
-        Args:
-            network: the tally of the network's results, before the consistency step.
-            change_squared: the sum of the squared changes by the consistency step.
-        """
-        return replace(
-            self,
-            change_squared=change_squared,
-            network_at_ends=network.at_ends,
-            network_after=network.after,
-            network_after_squared=network.after_squared,
-        )
-
     def __add__(self, other: "Tally") -> "Tally":
         return Tally(*map(add, astuple(self), astuple(other)))
 
@@ -243,28 +228,6 @@ class Tally:
             "results at ends": measured(100 * self.share_at_ends, "%", ends),
             "mean moved": measured(100 * self.moved, "% of full scale", mean),
         }
-
-    @property
-    def exposure_figures(self) -> Mapping[str, Figure]:
-        """The figures of a run with exposures, by name: runs of the network per tile, and the share
-        of results that were restored at a factor above 1.
-        """
-        runs = "exposures that tiles asked for, mean of the tiles"
-        pixels = "restored at an exposure above 1"
-        share = 100 * self.brightened / max(self.valid_results, 1)
-        return {
-            "network runs": measured(self.runs / max(self.tiles, 1), "run/tile", runs),
-            "brightened pixels": measured(share, "%", pixels),
-        }
-
-    @property
-    def consistency_figures(self) -> Mapping[str, Figure]:
-        """The figure of a run with the consistency step, by name: the root mean square of its
-        changes, in % of full scale.
-        """
-        rms = math.sqrt(self.change_squared / max(self.valid_results, 1))
-        source = "root mean square of what the step added to the known pixels"
-        return {"consistency step": measured(100 * rms, "% of full scale", source)}
 
     @property
     def doubts(self) -> list[str]:

@@ -6,6 +6,7 @@ depend on which of the two it is.
 """
 
 import logging
+import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
@@ -204,9 +205,19 @@ class NetworkRestoration(Restoration):
         """Return the figures of tiles, seams and tally, and of the steps that were used."""
         figures = {**self.plan.figures, **self.seams, **tally.figures}
         if any(len(network.infers) > 1 for network in self.restorer.networks):
-            figures |= tally.exposure_figures
+            mean_runs = tally.runs / max(tally.tiles, 1)
+            share = 100 * tally.brightened / max(tally.valid_results, 1)
+            figures["network runs"] = measured(
+                mean_runs, "run/tile", "exposures that tiles asked for, mean of the tiles"
+            )
+            figures["brightened pixels"] = measured(share, "%", "restored at an exposure above 1")
         if self.restorer.consistency:
-            figures |= tally.consistency_figures
+            rms = math.sqrt(tally.change_squared / max(tally.valid_results, 1))
+            figures["consistency step"] = measured(
+                100 * rms,
+                "% of full scale",
+                "root mean square of what the step added to the known pixels",
+            )
         return figures
 
 

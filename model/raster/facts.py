@@ -210,18 +210,6 @@ class Raster:
         """
         return self.dtype.kind == "f" or self.nodata is not None or bool(self.mask_kind)
 
-    def fill_margin_px(self, radius_px: int) -> int:
-        """Return the number of pixels around a tile that must be read too, to fill the missing
-        pixels of the tile.
-
-        Args:
-            radius_px: the receptive radius of the network. Farther pixels do not matter.
-
-        Returns:
-            `radius_px`, or 0 if the image cannot have missing pixels.
-        """
-        return radius_px if self.may_miss else 0
-
     def enlarged(self, shape: Sequence[int]) -> "Raster":
         """Return the facts of the restored image, which may have more pixels and other bands.
 

@@ -48,8 +48,12 @@ def settled_scale(
         OptionError: no pixel of this type can have the value `asked`.
     """
     if asked is not None:
-        check_scale(asked, dtype.kind)
-        return asked
+        floats = dtype.kind == "f"
+        fits = floats or (asked <= 65535 and asked % 1 == 0)
+        if 0 < asked < np.inf and fits:
+            return asked
+        allowed = "a number above 0" if floats else "an integer of 1 to 65535 for integer pixels"
+        raise OptionError(f"`full_scale` must be {allowed}, got {asked:g}. 12 bits are 4095.")
     if dtype.itemsize == 1:
         advice = remedy or f"{ADVICE} (255 for all of 8 bits), or use the raw image."
         raise ImageError(
@@ -69,20 +73,6 @@ def settled_scale(
         f"{name} has floats of at most {brightest:.3g}, which may be digital numbers, radiances or "
         f"shares of full scale. {advice}"
     )
-
-
-def check_scale(full_scale: float, kind: str) -> None:
-    """Raise OptionError if pixels of a type cannot have a full scale.
-
-    Args:
-        full_scale: the pixel value to check.
-        kind: NumPy's letter for the type of the pixels, "f" for floats.
-    """
-    fits_integers = full_scale <= 65535 and full_scale % 1 == 0
-    if 0 < full_scale < np.inf and (kind == "f" or fits_integers):
-        return
-    allowed = "a number above 0" if kind == "f" else "an integer of 1 to 65535 for integer pixels"
-    raise OptionError(f"`full_scale` must be {allowed}, got {full_scale:g}. 12 bits are 4095.")
 
 
 def remedy_outside(low: float, high: float, remedy: str) -> str:

@@ -5,7 +5,7 @@ of it, at each exposure that its pixels need. `Restorer.finish` makes the restor
 the raw ones and stores them. `restoration.tiles.rows` calls these for all tiles of an image.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -95,7 +95,8 @@ class Restorer:
     @property
     def margin_px(self) -> int:
         """The raw pixels that are read on each side of a tile, for filling and consistency."""
-        fill_px = self.raster.fill_margin_px(self.plan.radius_px)
+        # The missing pixels of a tile are filled from those around it.
+        fill_px = self.plan.radius_px if self.raster.may_miss else 0
         return max(fill_px, RAW_REACH_PX if self.consistency else 0)
 
     def read(self, source: Source, rows: Span) -> Strip:
@@ -181,7 +182,14 @@ class Restorer:
             pixels = np.clip(network_pixels + change, 0, np.float32(self.full_scale))
             squares = np.square((pixels - network_pixels) / self.full_scale)
             squared = float(np.nansum(squares, dtype=np.float64))
-            tally = tally_of(pixels).changed_from(tally, squared)
+            # The doubts about a result are about what the network returned, before this step.
+            tally = replace(
+                tally_of(pixels),
+                change_squared=squared,
+                network_at_ends=tally.at_ends,
+                network_after=tally.after,
+                network_after_squared=tally.after_squared,
+            )
         result = as_stored(self.raster, np.nan_to_num(pixels), self.full_scale)
         if missing is not None:
             result = np.where(missing, self._unrestored(raw, missing), result)
