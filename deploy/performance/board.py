@@ -33,12 +33,11 @@ from beers_deploy.performance.tables import (
     predicted_rows,
     processor_row,
     published_rows,
-    quoted_rows,
     sweep_rows,
     within_words,
 )
 from beers_deploy.profiles.errors import ModelError, OptionError, printable
-from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.figures import Row, published, unavailable
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import TILE_PX
@@ -310,6 +309,10 @@ def _frames(network: Network, asked: Question, why: ModelError) -> Bench:
     return _table(network, asked.boards, tables, [*fitted_words(rows), reason, *notes])
 
 
+QUOTED = {"latency": "ms", "throughput": "fps"}
+"""Name and unit of the figures in [published_latency_ms] and [published_throughput_fps]."""
+
+
 def quoted(network: Network, target: TargetProfile) -> Bench:
     """Return published figures of other networks, for a board that the cost model cannot predict.
 
@@ -320,11 +323,15 @@ def quoted(network: Network, target: TargetProfile) -> Bench:
     title = (
         f"{network.input.name} on {target.name}: nothing is predicted; other networks are published"
     )
-    return Bench(
-        inputs=(network.input,),
-        rows=tuple(quoted_rows(network.name, target)),
-        headings={TABLE: title},
-    )
+    reason = f"too few rates of {target.name} are published to fit a cost model"
+    figures = {key: unavailable(unit, reason) for key, unit in QUOTED.items()}
+    figures["power"] = unavailable("W", f"no power of {target.name} is published")
+    rows = [Row(TABLE, f"{network.name} on {target.name}", figures)]
+    for key, unit in QUOTED.items():
+        for name, constant in target.tables.get(f"published_{key}_{unit}", {}).items():
+            figure = published(constant.low, unit, constant.source)
+            rows.append(Row(TABLE, f"quoted: {name}", {key: figure}))
+    return Bench(inputs=(network.input,), rows=tuple(rows), headings={TABLE: title})
 
 
 def boards_for(

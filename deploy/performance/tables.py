@@ -72,31 +72,6 @@ def predicted_rows(name: str, prediction: Prediction, swath: Swath) -> list[Row]
     ]
 
 
-QUOTED = {"latency": "ms", "throughput": "fps"}
-"""Name and unit of the figures in [published_latency_ms] and [published_throughput_fps]."""
-
-
-def quoted_rows(network: str, target: TargetProfile) -> list[Row]:
-    """Return rows for a board that the cost model cannot predict.
-
-    Args:
-        network: the name of the user's network, whose figures are unavailable.
-        target: the board.
-
-    Returns:
-        The row of the network, then a row for each published figure of another network.
-    """
-    reason = f"too few rates of {target.name} are published to fit a cost model"
-    figures = {key: unavailable(unit, reason) for key, unit in QUOTED.items()}
-    figures["power"] = unavailable("W", f"no power of {target.name} is published")
-    rows = [Row(TABLE, f"{network} on {target.name}", figures)]
-    for key, unit in QUOTED.items():
-        for name, constant in target.tables.get(f"published_{key}_{unit}", {}).items():
-            figure = published(constant.low, unit, constant.source)
-            rows.append(Row(TABLE, f"quoted: {name}", {key: figure}))
-    return rows
-
-
 def published_rows() -> list[Row]:
     """Return the two runs on the VCK190 that the paper printed: the traditional pipeline on the
     processor, and ConvBEERS on the DPU, whose configuration it does not name.

@@ -67,11 +67,6 @@ class Frames:
         more = f" and {len(self.paths) - 1} more" if len(self.paths) > 1 else ""
         return f"{self.paths[0].name}{more}"
 
-    @property
-    def hides_black(self) -> bool:
-        """True if no pixel is near 0, so that the camera probably has a black level."""
-        return self.darkest_dn > DARK_SHARE * self.full_scale_dn
-
     def read(self, path: Path) -> np.ndarray:
         """Read the digital numbers (H, W) of one frame, float64, with 0 where they are missing.
 

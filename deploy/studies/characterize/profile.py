@@ -18,7 +18,7 @@ from beers_deploy.profiles.instrument import snr_0_bounds
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import sensor_toml
 from beers_deploy.profiles.shipped import BLIND
-from beers_deploy.studies.characterize.frames import Frames
+from beers_deploy.studies.characterize.frames import DARK_SHARE, Frames
 from beers_deploy.studies.characterize.measure import Noise, Snr
 
 PARTS = (16, 4)
@@ -123,7 +123,8 @@ class Measurement:
                 f"the values are multiples of {frames.step}: they count as {frames.bits}-bit "
                 f"numbers; restore these frames with full scale {frames.stored_full_scale}"
             )
-        if self.stated.black_level is None and frames.hides_black:
+        looks_dark = frames.darkest_dn <= DARK_SHARE * frames.full_scale_dn
+        if self.stated.black_level is None and not looks_dark:
             yield (
                 f"0 counts as dark, but the darkest pixels have {frames.darkest_dn * frames.step:g}"
                 ": state a black level of the camera as `black_level`, or the SNR in the dark is "
