@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from beers_deploy.profiles.constant import Constant, Words
-from beers_deploy.profiles.errors import OptionError, ProfileError, printable
+from beers_deploy.profiles.errors import ProfileError, printable
 from beers_deploy.profiles.shipped import MODEL_SUFFIX, board_names, target_names
 from beers_deploy.profiles.target_limits import ANY_KEY, check_limits
 from beers_deploy.profiles.toml import read_toml
@@ -240,10 +240,3 @@ def _joined(above: Mapping[str, Any], below: Mapping[str, Any]) -> dict[str, Any
         if isinstance(above[key], Mapping) and isinstance(below[key], Mapping):
             tables[key] = {**below[key], **above[key]}
     return tables
-
-
-def require_side(tile_px: int) -> int:
-    """Return the side of a tile in pixels unchanged, or raise OptionError if it is below 1."""
-    if tile_px < 1:
-        raise OptionError(f"`tile` must be at least 1 px, got {tile_px} px. Choose another.")
-    return tile_px

@@ -13,8 +13,7 @@ T = TypeVar("T")
 CONFIG = ConfigDict(extra="forbid")
 """The configuration of every model: an unknown key is an error and never ignored."""
 
-Count = Annotated[int, Field(strict=True, ge=0)]
-"""An integer of 0 or more, and neither a text nor True, which Python counts as an integer."""
+
 Amount = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
 """A finite number of 0 or more."""
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]

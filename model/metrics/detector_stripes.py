@@ -64,12 +64,10 @@ class Line:
         index: the number of the line.
         gain: the deviation of the line from its neighbours, as a share of the pixel value around
             it.
-        error: the standard error of `gain`.
     """
 
     index: int
     gain: float
-    error: float
 
 
 @dataclass(frozen=True)
@@ -216,7 +214,7 @@ def _single(
         # The neighbours of a line that is off are off by half of it, to the other side.
         if not numbers & {index - 1, index + 1}:
             numbers.add(int(index))
-            lines.append(Line(int(index), float(largest[index]), float(error[index])))
+            lines.append(Line(int(index), float(largest[index])))
     return lines
 
 

@@ -157,7 +157,18 @@ def place(network: SizedGraph, dpu: Dpu) -> Placement:
     broken = [judge(op, dpu, network.quantized) if part == "dpu-core" else () for op, part in pairs]
     # In a float file a cut at an end costs time and no more.
     if not network.quantized:
-        parts = _left_to_the_host(network, parts, broken)
+        before = _reached(network.operations, _convolved(network), forwards=False)
+        cpu_results: set[str] = set()
+        for number, op in enumerate(network.operations):
+            trails = op.output not in before
+            reads = bool(cpu_results & set(op.inputs))
+            # After the last convolution, a node that reads a result of the CPU stays on the CPU, so
+            # that the tensor is not transferred again.
+            follows = trails and not broken[number] and parts[number] == "dpu-core" and reads
+            if follows:
+                parts[number] = "host-back"
+            if trails and (broken[number] or follows):
+                cpu_results |= set(op.outputs)
     devices: list[Device] = []
     for part, rules in zip(parts, broken, strict=True):
         on_core: Device = "CPU" if rules else "DPU"
@@ -191,26 +202,6 @@ def _parts(network: SizedGraph) -> list[Part]:
         else:
             parts.append("dpu-core")
     return parts
-
-
-def _left_to_the_host(
-    network: SizedGraph, parts: list[Part], broken: list[tuple[Broken, ...]]
-) -> list[Part]:
-    """Leave more nodes of a float network to the host, and return the part of each node.
-
-    After the last convolution, a node that reads a result of the CPU stays on the CPU, so that the
-    tensor is not transferred again.
-    """
-    before = _reached(network.operations, _convolved(network), forwards=False)
-    cpu_results: set[str] = set()
-    moved: list[Part] = []
-    for op, part, rules in zip(network.operations, parts, broken, strict=True):
-        trails = op.output not in before
-        follows = trails and not rules and part == "dpu-core" and bool(cpu_results & set(op.inputs))
-        moved.append("host-back" if follows else part)
-        if trails and (rules or follows):
-            cpu_results |= set(op.outputs)
-    return moved
 
 
 def _convolved(network: SizedGraph) -> set[str]:

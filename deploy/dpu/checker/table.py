@@ -18,7 +18,7 @@ from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.figures import Check, Figure, Row, predicted, unavailable
-from beers_deploy.profiles.target import TargetProfile, require_side
+from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.encodings import implicit_parts
 from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.graph import refusal
@@ -101,9 +101,7 @@ def check_network(
     if output is not None:
         source = source.with_output(output)
     build = device_of(target, dpu)
-    tile_px = usual_tile_px(source.model)
-    if tile is not None:
-        tile_px = require_side(tile)
+    tile_px = usual_tile_px(source.model) if tile is None else tile
     sized = network_of(source.model, tile_px, source.label)
     placement = place(sized, build)
     npu = bool(target.npu)
@@ -180,7 +178,19 @@ def _rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:
             size = _count(cut.size_bytes, "byte/image")
         words = {"direction": "onto the DPU" if cut.onto_dpu else "off the DPU"}
         cuts.append(Row("cuts", cut.tensor, {"size": size}, words))
-    return [*nodes, *_subgraph_rows(placement), *cuts, *remarks, summary]
+    members_of: dict[int, list[PlacedNode]] = {}
+    for node in placement.nodes:
+        members_of.setdefault(node.subgraph, []).append(node)
+    subgraphs = []
+    for number, members in members_of.items():
+        words = {
+            "device": members[0].device,
+            "first": members[0].op.name,
+            "last": members[-1].op.name,
+        }
+        figures = {"nodes": _count(len(members), "node")}
+        subgraphs.append(Row("subgraphs", f"subgraph {number}", figures, words))
+    return [*nodes, *subgraphs, *cuts, *remarks, summary]
 
 
 def legality(placement: Placement, *, npu: bool = False) -> Check:
@@ -284,22 +294,6 @@ def _device(node: PlacedNode, placement: Placement, dpu: Dpu) -> str:
     if node.op.op_type in dpu.target.npu["int8"].value:
         return "NPU by AMD's table"
     return "not read in AMD's table"
-
-
-def _subgraph_rows(placement: Placement) -> list[Row]:
-    members_of: dict[int, list[PlacedNode]] = {}
-    for node in placement.nodes:
-        members_of.setdefault(node.subgraph, []).append(node)
-    rows = []
-    for number, members in members_of.items():
-        words = {
-            "device": members[0].device,
-            "first": members[0].op.name,
-            "last": members[-1].op.name,
-        }
-        figures = {"nodes": _count(len(members), "node")}
-        rows.append(Row("subgraphs", f"subgraph {number}", figures, words))
-    return rows
 
 
 def _count(value: int, unit: str) -> Figure:
