@@ -5,27 +5,10 @@ one.
 import logging
 import os
 
-from beers_deploy.profiles.errors import ProfileError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import REFERENCE
 
 logger = logging.getLogger(__name__)
-
-
-def require_same_units(degraded: Sensor, reference: Sensor) -> None:
-    """Raise ProfileError if two sensors have different gains, bits or offsets: their images would
-    differ by a factor.
-
-    Args:
-        degraded: the sensor whose images are restored.
-        reference: the better sensor that the restoration aims at.
-    """
-    if degraded.units != reference.units:
-        raise ProfileError(
-            f"The sensor profile {reference.name}, the reference of {degraded.name}, must have "
-            f"{describe_units(degraded)}, but it has {describe_units(reference)}. Convert the "
-            "reference to the degraded sensor's units."
-        )
 
 
 def describe_units(profile: Sensor) -> str:
