@@ -278,8 +278,17 @@ def pair_of(
     if int8_network is None and isinstance(float_network, Network) and float_network.origin:
         return float_network.origin.with_output(output), float_network
     if int8_network is None:
-        int8_network = _shipped_int8(float_network)
-        float_network = str(int8_network).removesuffix(INT8)
+        if not stands_for_pair(float_network):
+            label = getattr(float_network, "name", type(float_network).__name__)
+            raise OptionError(
+                "The INT8 network of "
+                f"{float_network if isinstance(float_network, str) else label} is missing. "
+                "Give it as `int8_network`, or give the name of a shipped pair."
+            )
+        float_network = VARIANT if float_network is None else str(float_network).removesuffix(INT8)
+        # This refuses names under which nothing is shipped.
+        shipped_weights(float_network)
+        int8_network = f"{float_network}{INT8}"
     floating = Network.load(
         VARIANT if float_network is None else float_network, sensor=sensor, int8=False
     )
@@ -300,16 +309,3 @@ def stands_for_pair(network: NetworkLike | None) -> bool:
     if isinstance(network, str | os.PathLike):
         return not (Path(network).suffix or Path(network).exists())
     return network is None
-
-
-def _shipped_int8(network: NetworkLike | None) -> str:
-    """Return the name of the INT8 network of a shipped pair, given the name of either network."""
-    if not stands_for_pair(network):
-        label = getattr(network, "name", type(network).__name__)
-        raise OptionError(
-            f"The INT8 network of {network if isinstance(network, str) else label} is missing. "
-            "Give it as `int8_network`, or give the name of a shipped pair."
-        )
-    name = VARIANT if network is None else str(network).removesuffix(INT8)
-    shipped_weights(name)
-    return f"{name}{INT8}"

@@ -64,7 +64,13 @@ def run(
     except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - no fault must look like a failed gate
         message, code = ending(error, command)
         if isinstance(error, BeersError) and options.get("junit") not in (None, STDOUT):
-            _write_junit(command, _arguments(options), json, message)
+            from beers_deploy.model.io.files import write_text
+            from beers_deploy.verdict import junit_error
+
+            # A refused output path gets no file.
+            with suppress(BeersError):
+                require_apart(command.verb, _arguments(options), json)
+                write_text(options["junit"], junit_error("INT8 gate", message))
         if verbose or code == CRASHED:
             traceback.print_exc()
         typer.echo(f"beers-deploy: {visible(message)}", err=True)
@@ -79,20 +85,6 @@ def run(
 def _arguments(options: dict[str, Any]) -> dict[str, Any]:
     """Return the options that are on the command line or have a default."""
     return {name: value for name, value in options.items() if value not in (None, [])}
-
-
-def _write_junit(
-    command: Command, arguments: dict[str, Any], json: Path | None, message: str
-) -> None:
-    """Write the reason why a gate could not judge to its JUnit file, unless an output path is
-    refused.
-    """
-    from beers_deploy.model.io.files import write_text
-    from beers_deploy.verdict import junit_error
-
-    with suppress(BeersError):
-        require_apart(command.verb, arguments, json)
-        write_text(arguments["junit"], junit_error("INT8 gate", message))
 
 
 def _result(command: Command, options: dict[str, Any], json: Path | None) -> Any:

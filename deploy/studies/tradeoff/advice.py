@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from beers_deploy.performance.swath import interval_ends
 from beers_deploy.profiles.errors import OptionError, printable
-from beers_deploy.profiles.figures import Figure, Row
+from beers_deploy.profiles.figures import Row
 from beers_deploy.studies.tradeoff.front import (
     BOARDS,
     COSTS,
@@ -79,13 +79,6 @@ class Constraint:
         miss = over if self.at_most else -over
         # A limit of 0 has no share: there the miss itself counts.
         return math.inf if math.isnan(miss) else max(miss, 0.0) / (abs(self.limit) or 1.0)
-
-    def holds_throughout(self, figure: Figure) -> bool:
-        """Return True if the whole interval of a figure complies with the limit, not only its
-        value.
-        """
-        low, high = interval_ends(figure)
-        return high <= self.limit if self.at_most else low >= self.limit
 
 
 def parse_constraints(option: str, text: str | None) -> list[Constraint]:
@@ -199,7 +192,9 @@ def recommend(points: Sequence[Measured], asked: Question) -> tuple[Measured | N
     ):
         line += f"; {best.name} has {gain} dB more, {verdict(gain)}"
     for constraint in constraints:
-        if not constraint.holds_throughout(choice.figures[constraint.key]):
+        low, high = interval_ends(choice.figures[constraint.key])
+        holds = high <= constraint.limit if constraint.at_most else low >= constraint.limit
+        if not holds:
             line += f"; {constraint} holds by value, not over the whole interval"
     return choice, line
 
