@@ -66,6 +66,20 @@ def host_facts(
     if facts is None:
         return None
     instrument = None if sensor is None or sensor.name == BLIND else sensor.nominal()
+    self_check: Facts | None = None
+    if sensor is not None and step is not None:
+        check = SelfCheck.of(sensor.nominal(), sensor.reference.nominal(), full_scale=1.0)
+        self_check = {
+            "rows": check.rows.tolist(),
+            "columns": check.columns.tolist(),
+            "variances": list(check.variances),
+            "cell": CELL_PX,
+            "smooth": SMOOTH_PX,
+            "smooth_weight": SMOOTH_WEIGHT,
+            "most_chi2": MOST_CHI2,
+            "most_per_sharpening": MOST_PER_SHARPENING,
+            "least_sharpening": LEAST_SHARPENING,
+        }
     return {
         **facts,
         # For another exposure only the unit differs, since the network is the same.
@@ -79,7 +93,7 @@ def host_facts(
         "edge_px": edge_radius_px(network.tiling.halo_px),
         "offset": instrument.offset_dn / instrument.max_dn if instrument else 0.0,
         "consistency": step,
-        "self_check": None if sensor is None or step is None else self_check_facts(sensor),
+        "self_check": self_check,
     }
 
 
@@ -149,31 +163,6 @@ def _require_room(tile_px: int, tiling: Tiling) -> None:
             f"`tile` must be {multiple}at least {smallest_px} px, because the network needs a halo "
             f"of {tiling.halo_px} px on each side, got {tile_px} px. Choose another."
         )
-
-
-def self_check_facts(sensor: Sensor) -> Facts:
-    """Return the constants of the self-check, which blurs the result as the sensor blurs and
-    compares it with the raw image.
-
-    Args:
-        sensor: the sensor that acquires the images.
-
-    Returns:
-        The weights of the blur, the variances of the noise and the limits, for pixels in [0, 1] of
-        full scale, by the names that `host.py` reads.
-    """
-    check = SelfCheck.of(sensor.nominal(), sensor.reference.nominal(), full_scale=1.0)
-    return {
-        "rows": check.rows.tolist(),
-        "columns": check.columns.tolist(),
-        "variances": list(check.variances),
-        "cell": CELL_PX,
-        "smooth": SMOOTH_PX,
-        "smooth_weight": SMOOTH_WEIGHT,
-        "most_chi2": MOST_CHI2,
-        "most_per_sharpening": MOST_PER_SHARPENING,
-        "least_sharpening": LEAST_SHARPENING,
-    }
 
 
 def consistency_facts(network: Network, sensor: Sensor) -> Facts | None:

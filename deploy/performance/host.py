@@ -105,41 +105,28 @@ def host_rows(
         figures = _figures(samples, held_bytes) | conditions
         rows.append(Row("host", f"{name}, {tile_px} x {tile_px}", figures))
     if sensor is not None:
-        rows.append(step_row(sensor, tile_px, min_time_s, min_runs))
+        # The step runs on one thread, on a tile of noise.
+        instrument = sensor.nominal()
+        step = Consistency.of(instrument, sensor.reference.nominal())
+        generator = np.random.default_rng(0)
+        noise = generator.uniform(0, instrument.max_dn / 2, (tile_px, tile_px))
+        raw = noise.astype(np.float32)
+        side = Placed(tile_px, 0, 0, tile_px)
+        correct = partial(step.correction, raw, raw, side, side, (0, 0))
+        correct()
+        samples = interleaved([correct], min_runs, min_time_s)[0]
+        times_ms = np.array([1e3 * time_s for time_s, _ in samples])
+        how = f"{len(times_ms)} runs on one thread after one for warm-up"
+        figures = {
+            f"p{p}": measured(float(np.percentile(times_ms, p)), "ms/tile", how) for p in (50, 90)
+        }
+        rows.append(Row("host", f"consistency step, {tile_px} x {tile_px}", figures))
     if other is not None:
         own_s, other_s = (statistics.median(time_s for time_s, _ in run) for run in runs)
         ratio = own_s / other_s if other.precision == "int8" else other_s / own_s
         figure = measured(ratio, "x", f"medians of {len(runs[0])} runs each, interleaved")
         rows.append(Row("host", "float32 time / INT8 time, here", {"ratio": figure}))
     return rows
-
-
-def step_row(sensor: Sensor, tile_px: int, min_time_s: float, min_runs: int) -> Row:
-    """Time the consistency step on one thread of this machine, on a tile of noise.
-
-    The step makes block means of a restored image agree with the raw image.
-
-    Args:
-        sensor: the sensor, whose blur the step uses.
-        tile_px: side of the tile in pixels.
-        min_time_s: the shortest total time of the runs, in s.
-        min_runs: the smallest number of runs.
-    """
-    instrument = sensor.nominal()
-    step = Consistency.of(instrument, sensor.reference.nominal())
-    generator = np.random.default_rng(0)
-    noise = generator.uniform(0, instrument.max_dn / 2, (tile_px, tile_px))
-    raw = noise.astype(np.float32)
-    side = Placed(tile_px, 0, 0, tile_px)
-    call = partial(step.correction, raw, raw, side, side, (0, 0))
-    call()
-    samples = interleaved([call], min_runs, min_time_s)[0]
-    times_ms = np.array([1e3 * time_s for time_s, _ in samples])
-    source = f"{len(times_ms)} runs on one thread after one for warm-up"
-    figures = {
-        f"p{p}": measured(float(np.percentile(times_ms, p)), "ms/tile", source) for p in (50, 90)
-    }
-    return Row("host", f"consistency step, {tile_px} x {tile_px}", figures)
 
 
 def conditions_of(threads: int) -> dict[str, Figure]:

@@ -180,6 +180,5 @@ else:
     ProfileName = Annotated[str, Completed(profile_names)]
     TargetLike = Targets = Annotated[str, Completed(target_names, listed=True), Wider()]
     Progress = Annotated[object, PythonOnly()]
-    Halo = Tiles = Size = Steps = Factors = Methods = Mtf = Annotated[str, Wider()]
+    Halo = Tiles = Size = Steps = Factors = Methods = Mtf = InputRange = Annotated[str, Wider()]
     Names = Annotated[str, Wider(names=True)]
-    InputRange = Annotated[str, Wider()]

@@ -165,7 +165,17 @@ def fit_noise(blocks: Blocks, incomplete: bool = False) -> NoiseModel | Refusal:
         fits.append(_fitted(quiet, counts[numbers]))
     draws = np.array(fits)
     if one_level:
-        fit, draws = _of_one_level(quiet, fit, draws, generator)
+        # How the noise grows with light is unknown. The fit attributes all of it to photons: given
+        # too much noise in bright light, a restoration smooths; given too little, it produces
+        # grain. The draws range from none to all.
+        level = float(np.median(quiet.mean))
+        shares = np.append(1.0, generator.uniform(size=len(draws)))
+        numbers = np.vstack([fit, draws])
+        noise = numbers[:, 0] * level + numbers[:, 1]
+        alpha = shares * noise / max(level, ROUNDING)
+        splits = np.stack([alpha, (1 - shares) * noise, numbers[:, 2]], axis=1)
+        fit = splits[0]
+        draws = splits[1:]
     leak = float(
         fit[2] * np.maximum(quiet.structure - quiet.noise(fit), 0).mean() / quiet.fine.mean()
     )
@@ -186,24 +196,6 @@ def _judged(model: NoiseModel, incomplete: bool) -> NoiseModel | Refusal:
         return model
     mosaic = "not white" if model.colour >= MOSAIC else "a mosaic of unequal channels"
     return Refusal(f"noise {model.colour:.2f} times as strong at middle frequencies: {mosaic}")
-
-
-def _of_one_level(
-    blocks: Blocks, fit: np.ndarray, draws: np.ndarray, generator: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return fit and draws of noise whose growth with light is unknown: any part may be photon
-    noise.
-
-    The fit attributes all of it to photons. Given too much noise in bright light, a restoration
-    smooths; given too little, it produces grain. The draws range from none to all.
-    """
-    level = float(np.median(blocks.mean))
-    shares = np.append(1.0, generator.uniform(size=len(draws)))
-    numbers = np.vstack([fit, draws])
-    noise = numbers[:, 0] * level + numbers[:, 1]
-    alpha = shares * noise / max(level, ROUNDING)
-    splits = np.stack([alpha, (1 - shares) * noise, numbers[:, 2]], axis=1)
-    return splits[0], splits[1:]
 
 
 def _choose(blocks: Blocks) -> tuple[Blocks, np.ndarray]:

@@ -19,12 +19,13 @@ from typing import Any
 
 import numpy as np
 
+from beers_deploy.model.metrics.instrument import snr
 from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.results import Table, input_of
 from beers_deploy.studies.characterize.frames import MAX_DN, cut_box, open_frames
-from beers_deploy.studies.characterize.measure import measure_mtf, measure_noise, snr_at
+from beers_deploy.studies.characterize.measure import Snr, measure_mtf, measure_noise
 from beers_deploy.studies.characterize.profile import (
     FULL_SCALE_RADIANCE,
     PARTS,
@@ -69,8 +70,13 @@ def measure(
     noise = measure_noise(frames)
     mtf = measure_mtf(frames, regions, noise.model) if stated.mtf is None else {}
     gain = stated.gain or frames.full_scale_dn / FULL_SCALE_RADIANCE
-    low, high = (snr_at(noise.model, frames.full_scale_dn / part, gain) for part in PARTS)
-    return Measurement(frames, noise, mtf, (low, high), gain, stated)
+    snrs = []
+    for part in PARTS:
+        dn = frames.full_scale_dn / part
+        # The noise of rounding is not part of it.
+        variance = noise.model.at(dn)
+        snrs.append(Snr(dn / gain, *snr(dn, variance), variance.extrapolated))
+    return Measurement(frames, noise, mtf, (snrs[0], snrs[1]), gain, stated)
 
 
 @dataclass(frozen=True, kw_only=True)

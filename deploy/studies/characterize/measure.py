@@ -14,7 +14,6 @@ from beers_deploy.model.metrics.instrument import (
     above_black,
     axis_curves,
     image_blocks,
-    snr,
 )
 from beers_deploy.model.metrics.noise_blocks import Blocks, cut_pair, join
 from beers_deploy.model.metrics.noise_line import NoiseModel, fit_noise
@@ -196,15 +195,3 @@ class Snr:
     value: float
     interval: tuple[float, float]
     extrapolated: bool
-
-
-def snr_at(noise: NoiseModel, dn: float, gain: float) -> Snr:
-    """Compute the SNR of a camera at one level of light, without the noise of rounding.
-
-    Args:
-        noise: the noise as a function of the digital number above the black level.
-        dn: the digital number above the black level.
-        gain: the digital numbers per W/m2/sr/um.
-    """
-    variance = noise.at(dn)
-    return Snr(dn / gain, *snr(dn, variance), variance.extrapolated)

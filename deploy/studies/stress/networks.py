@@ -217,20 +217,3 @@ def in_torch(graph: Graph, image: Tensor) -> Tensor:
         result = conv2d(tensors[op.input], weight, bias, padding=op.window.pads[0])
         tensors[op.output] = torch.relu(result) if op.activation is Activation.relu else result
     return image + pixel_shuffle(tensors[CORRECTION], place_px)
-
-
-def steepest_signs(graph: Graph, image: np.ndarray) -> np.ndarray:
-    """Return the change of the input that moves the restored pixel in the middle most, to first
-    order.
-
-    Args:
-        graph: the network's convolutions and additions.
-        image: shares of full scale, (H, W).
-
-    Returns:
-        The signs of the gradient of the middle pixel, -1, 0 or 1, (H, W).
-    """
-    pixels = torch.from_numpy(image)[None, None].requires_grad_()
-    middle = in_torch(graph, pixels)[0, 0, image.shape[0] // 2, image.shape[1] // 2]
-    (gradient,) = torch.autograd.grad(middle, pixels)
-    return np.asarray(gradient[0, 0].sign().numpy())

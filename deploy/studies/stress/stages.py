@@ -10,7 +10,7 @@ from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.studies.stress import checks
 from beers_deploy.studies.stress.cases import FULL_DN, Case
-from beers_deploy.studies.stress.networks import Runner, Subject, in_torch, steepest_signs
+from beers_deploy.studies.stress.networks import Runner, Subject, in_torch
 
 GAIN_DN = 16.0
 STEEPEST_DN = 64.0
@@ -45,7 +45,12 @@ def float32(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Meas
         extended = network.extended(_fractions(image))
         exact = in_torch(graph, torch.from_numpy(extended).double()).numpy()
         error = FULL_DN * float(np.abs(network.infer()(extended) - exact).max())
-        signs = steepest_signs(graph, extended[0, 0])[: image.shape[0], : image.shape[1]]
+        # The signs of the gradient of the middle pixel: to first order, this change of the input
+        # moves it most.
+        pixels = torch.from_numpy(extended).requires_grad_()
+        middle = in_torch(graph, pixels)[0, 0, extended.shape[2] // 2, extended.shape[3] // 2]
+        (gradient,) = torch.autograd.grad(middle, pixels)
+        signs = gradient[0, 0, : image.shape[0], : image.shape[1]].sign().numpy()
         steepest = checks.change(network.restore, image, network.restore(image), signs)
         measures.append(checks.Measure("error against float64", error, FLOAT32_DN))
         measures.append(checks.Measure("gain, steepest", steepest, STEEPEST_DN, "DN per DN"))

@@ -233,24 +233,6 @@ def choose(candidates: Sequence[Measured], asked: Question) -> tuple[Measured, M
     ), best
 
 
-def affordable(
-    points: Sequence[Measured], constraints: Sequence[Constraint], cost: str
-) -> Sequence[Measured]:
-    """Return the points that comply with the limits on figures other than PSNR and cost, or all
-    points if none does.
-
-    The front shows PSNR against one cost. Without this filter, a point that the budget excludes for
-    another reason, such as its power, would hide those that can be recommended.
-
-    Args:
-        points: the operating points.
-        constraints: all limits of budget and need.
-        cost: the name of the cost that the front shows.
-    """
-    others = [constraint for constraint in constraints if constraint.key not in (PSNR, cost)]
-    return within(points, others, cost) or points
-
-
 def _violation(point: Measured, constraints: Sequence[Constraint]) -> float:
     """Return by how much a point misses the constraint that it misses most; 0 if it complies."""
     return max((constraint.violation(point) for constraint in constraints), default=0.0)
@@ -326,20 +308,3 @@ def board_rows(
         text = {"point": best.name, "verdict": words}
         rows.append(Row(BOARDS, board, figures_to_compare(best, cost), text))
     return rows
-
-
-def board_lines(rows: Sequence[Row]) -> list[str]:
-    """Return the sentences on boards that a study reports as notes.
-
-    Args:
-        rows: the rows that `board_rows` returns.
-
-    Returns:
-        A sentence for each of several boards. A single board has a sentence only if no point of it
-        complies with the limits.
-    """
-    return [
-        f"{row.name}: {row.text['point'] + ': ' if row.figures else ''}{row.text['verdict']}"
-        for row in rows
-        if len(rows) > 1 or not row.figures
-    ]

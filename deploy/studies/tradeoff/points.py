@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import chain, product
+from itertools import chain
 from pathlib import Path
 
 from beers_deploy.conditioned_file import to_run_on
@@ -21,8 +21,6 @@ from beers_deploy.dpu.cost.latency import dpu_power, predict
 from beers_deploy.dpu.graph import SizedGraph
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.model.shipped import shipped_names
-from beers_deploy.model.traditional.baselines import BASELINES
-from beers_deploy.model.traditional.patch_groups import QUALITIES
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.performance import tables
 from beers_deploy.performance.swath import (
@@ -175,28 +173,6 @@ def _variants(
         logger.warning("%s is compared in float32 alone: %s", network.label, error)
         return
     yield Variant(network.name, INT8, int8)
-
-
-def points_of(
-    networks: Iterable[Variant], boards: Sequence[TargetProfile], whole: Swath
-) -> list[Point]:
-    """Return all operating points of a study, before they are measured.
-
-    Networks in INT8 run on the DPUs of the boards, traditional pipelines on the boards' processors,
-    and float networks and methods of other libraries on this machine alone.
-
-    Args:
-        networks: the networks, each in float32 and in INT8.
-        boards: the boards, each with a DPU.
-        whole: the swath (the large image) whose time is predicted.
-    """
-    of_networks = (network_points(variant, boards, whole) for variant in networks)
-    traditional = [Variant(f"traditional-{quality}") for quality in QUALITIES]
-    return [
-        *chain.from_iterable(of_networks),
-        *(Point(variant, board) for variant, board in product(traditional, boards)),
-        *(Point(Variant(baseline)) for baseline in BASELINES),
-    ]
 
 
 def network_points(variant: Variant, boards: Sequence[TargetProfile], whole: Swath) -> list[Point]:

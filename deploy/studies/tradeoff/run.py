@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain, product
 from pathlib import Path
 from typing import cast
 
@@ -17,6 +18,8 @@ from beers_deploy.model.metrics.bootstrap import too_few
 from beers_deploy.model.metrics.perceptual import find_backbone
 from beers_deploy.model.progress import steps
 from beers_deploy.model.raster.images import list_images
+from beers_deploy.model.traditional.baselines import BASELINES
+from beers_deploy.model.traditional.patch_groups import QUALITIES
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.performance.swath import PAPER_SIZE, Swath, parse_size
 from beers_deploy.performance.tables import PAPER_TARGET, published_rows
@@ -31,7 +34,7 @@ from beers_deploy.results import Input, Table, input_of
 from beers_deploy.studies.evaluation.methods import Method, method_named, method_of
 from beers_deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes
 from beers_deploy.studies.tradeoff import advice
-from beers_deploy.studies.tradeoff.front import Comparison, Measured, front_rows, pareto_front
+from beers_deploy.studies.tradeoff.front import PSNR, Comparison, Measured, front_rows, pareto_front
 from beers_deploy.studies.tradeoff.measure import (
     ROUNDS,
     TILE_PX,
@@ -46,8 +49,8 @@ from beers_deploy.studies.tradeoff.points import (
     Point,
     Variant,
     board_figures,
+    network_points,
     network_variants,
-    points_of,
 )
 
 logger = logging.getLogger(__name__)
@@ -151,7 +154,16 @@ def points_for(study: Study, quantize: Callable[[Network], Network]) -> list[Poi
         quantize: returns the INT8 network of a float one, or raises ModelError.
     """
     variants = network_variants(study.networks, study.sensors[0], quantize)
-    return points_of(variants, study.boards, Swath(*study.size))
+    whole = Swath(*study.size)
+    of_networks = (network_points(variant, study.boards, whole) for variant in variants)
+    # Networks in INT8 run on the DPUs of the boards, traditional pipelines on the boards'
+    # processors, and float networks and methods of other libraries on this machine alone.
+    traditional = [Variant(f"traditional-{quality}") for quality in QUALITIES]
+    return [
+        *chain.from_iterable(of_networks),
+        *(Point(variant, board) for variant, board in product(traditional, study.boards)),
+        *(Point(Variant(baseline)) for baseline in BASELINES),
+    ]
 
 
 def run_tradeoff(study: Study) -> Tradeoff:
@@ -260,9 +272,18 @@ def weigh(
     """
     cost = asked.cost(points)
     best, line = advice.recommend(points, asked)
-    front = pareto_front(advice.affordable(points, asked.constraints, cost), cost)
+    # The front shows PSNR against one cost: a point that the budget excludes for another reason,
+    # such as its power, would hide those that can be recommended.
+    others = [constraint for constraint in asked.constraints if constraint.key not in (PSNR, cost)]
+    front = pareto_front(advice.within(points, others, cost) or points, cost)
     numbered = front_rows(front, cost, asked.compare)
     by_board = advice.board_rows(points, boards, best, asked)
+    # A single board has a sentence only if no point of it complies with the limits.
+    sentences = [
+        f"{row.name}: {row.text['point'] + ': ' if row.figures else ''}{row.text['verdict']}"
+        for row in by_board
+        if len(by_board) > 1 or not row.figures
+    ]
     name = best.name if best else "none"
     figures = best.figures if best else {}
     every = (Row("points", point.name, point.figures, point.text) for point in points)
@@ -273,7 +294,7 @@ def weigh(
         title="what accuracy costs in time",
         rows=rows,
         checks=(fits,),
-        notes=(line, *advice.board_lines(by_board), *remarks),
+        notes=(line, *sentences, *remarks),
         details=frozenset({"recommended", "boards", "points"}),
         points=points,
         front=front,
