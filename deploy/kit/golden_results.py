@@ -6,7 +6,7 @@ the board can return. docs/how-to/board.md explains what a pattern usually means
 """
 
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -61,7 +61,14 @@ def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[st
     detail = ""
     if wrong:
         detail = f"the first to differ is {_layer(golden.core, wrong[0])}"
-        if unseen := _unseen_before(golden.core, wrong[0], outputs):
+        needed = {wrong[0]}
+        unseen = 0
+        # Go back from the last operation until every path ends at a tensor that was returned.
+        for op in reversed(golden.core.ops):
+            if op.output in needed and (op.output == wrong[0] or op.output not in outputs):
+                needed |= set(op.inputs)
+                unseen += op.output != wrong[0]
+        if unseen:
             detail += f", {unseen} layers before it were not handed out"
     return Table(
         title=f"{results_folder.name} against {Path(folder).name}",
@@ -136,18 +143,6 @@ def _integers(path: Path, shape: tuple[int, ...], frac_bits: int) -> np.ndarray:
 def _layer(core: IntCore, name: str) -> str:
     """Return the name of the operation that writes a tensor."""
     return next((op.name for op in core.ops if op.output == name), PLANES)
-
-
-def _unseen_before(core: IntCore, name: str, outputs: Collection[str]) -> int:
-    """Return the number of operations between a tensor and those that a board returned."""
-    needed = {name}
-    count = 0
-    # Go back from the last operation until every path ends at a tensor that was returned.
-    for op in reversed(core.ops):
-        if op.output in needed and (op.output == name or op.output not in outputs):
-            needed |= set(op.inputs)
-            count += op.output != name
-    return count
 
 
 def where(differs: np.ndarray) -> str:

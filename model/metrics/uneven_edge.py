@@ -152,7 +152,12 @@ def fit_edge(
         texture = max(float(np.average(rest**2, weights=huber)) - float(variance.mean()), 0.0)
         pixel_weights = np.sqrt(huber / (variance + texture))
         rise = plane @ (levels[3:] - levels[:3])
-        by_line = _by_line(along_px, line, rise * at_distances(line_table, distance_px), height)
+        # The derivatives of each pixel by place, slope and bow of the line.
+        slope = rise * at_distances(line_table, distance_px)
+        by_place = -slope / math.hypot(1, line.slope)
+        by_line = np.stack(
+            [by_place, by_place * along_px, by_place * (2 * along_px / height) ** 2], axis=1
+        )
         expected, expected_rest = _expectations(levels, line, step)
         normal = np.vstack([np.hstack([by_levels, by_line]) * pixel_weights[:, None], expected])
         curve = np.vstack(
@@ -194,15 +199,6 @@ def _near(pixels: EdgePixels, line: EdgeLine) -> tuple[np.ndarray, ...]:
     distance_px = across / math.hypot(1, line.slope)
     near = np.abs(distance_px) <= HALF_PX
     return distance_px[near], y[near], pixels.values[near], pixels.variance[near]
-
-
-def _by_line(along: np.ndarray, line: EdgeLine, slope: np.ndarray, height: int) -> np.ndarray:
-    """Return the derivatives (P, 3) of the pixels by place, slope and bow, from their rows `along`.
-
-    `slope` (P,) is the derivative by the distance.
-    """
-    by_place = -slope / math.hypot(1, line.slope)
-    return np.stack([by_place, by_place * along, by_place * (2 * along / height) ** 2], axis=1)
 
 
 def _expectations(levels: np.ndarray, line: EdgeLine, step: float) -> tuple[np.ndarray, np.ndarray]:

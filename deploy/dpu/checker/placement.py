@@ -173,7 +173,23 @@ def place(network: SizedGraph, dpu: Dpu) -> Placement:
     for part, rules in zip(parts, broken, strict=True):
         on_core: Device = "CPU" if rules else "DPU"
         devices.append(on_core if part == "dpu-core" else "host")
-    subgraphs = _subgraphs(network.operations, devices)
+    # A subgraph is connected nodes on one device with no node of another device between them.
+    depth: dict[str, tuple[bool, int]] = {}
+    parents: dict[str, str] = {}
+    for op, device in zip(network.operations, devices, strict=True):
+        on_dpu = device == "DPU"
+        # A level counts the changes of device up to this node. Nodes after a return to the DPU
+        # have another level than those before it, so the two are never one subgraph.
+        levels = (depth[name] for name in op.inputs if name in depth)
+        steps = [changes + (was_on_dpu != on_dpu) for was_on_dpu, changes in levels]
+        level = (on_dpu, max(steps, default=0))
+        depth |= dict.fromkeys(op.outputs, level)
+        for name in (*op.outputs, *(name for name in op.inputs if depth.get(name) == level)):
+            parents[_root(parents, op.output)] = _root(parents, name)
+    numbers: dict[str, int] = {}
+    subgraphs = [
+        numbers.setdefault(_root(parents, op.output), len(numbers)) for op in network.operations
+    ]
     nodes = tuple(map(PlacedNode, network.operations, parts, devices, broken, subgraphs))
     return Placement(nodes, tuple(_cuts(network, nodes)), "" if network.quantized else FLOAT_NOTE)
 
@@ -256,26 +272,6 @@ def _is_host_back(op: Operation, network: SizedGraph, *, leads: bool) -> bool:
     return op.op_type in SCALING and (
         bool(set(op.inputs) & set(network.inputs)) or len(op.inputs) == 1
     )
-
-
-def _subgraphs(operations: tuple[Operation, ...], devices: list[Device]) -> list[int]:
-    """Return the number of the subgraph of each node: connected nodes on one device with no node of
-    another device between them.
-    """
-    depth: dict[str, tuple[bool, int]] = {}
-    parents: dict[str, str] = {}
-    for op, device in zip(operations, devices, strict=True):
-        on_dpu = device == "DPU"
-        # A level counts the changes of device up to this node. Nodes after a return to the DPU
-        # have another level than those before it, so the two are never one subgraph.
-        levels = (depth[name] for name in op.inputs if name in depth)
-        steps = [changes + (was_on_dpu != on_dpu) for was_on_dpu, changes in levels]
-        level = (on_dpu, max(steps, default=0))
-        depth |= dict.fromkeys(op.outputs, level)
-        for name in (*op.outputs, *(name for name in op.inputs if depth.get(name) == level)):
-            parents[_root(parents, op.output)] = _root(parents, name)
-    numbers: dict[str, int] = {}
-    return [numbers.setdefault(_root(parents, op.output), len(numbers)) for op in operations]
 
 
 def _root(parents: dict[str, str], name: str) -> str:

@@ -63,24 +63,8 @@ def measure_noise(frames: Frames) -> Noise:
         image_blocks(frames.tiles(path), frames.full_scale_dn, frames.black_dn)
         for path in frames.paths
     ]
-    # The difference of two frames of a still scene holds no texture.
-    still = [above_black(blocks, frames.black_dn) for blocks in _still_pairs(frames)]
-    model = fit_noise(join(still or frame_blocks), incomplete=True)
-    if isinstance(model, Refusal):
-        raise ImageError(
-            f"The noise of {frames.name} cannot be measured: {model.reason}. It is measured on "
-            "blurred, raw ground from dark to bright: give more raw images of plain ground, dark "
-            "and bright, neither restored nor resampled."
-        )
-    if not still and len(frame_blocks) > 1:
-        _require_one_sensor(frames, frame_blocks, math.sqrt(math.prod(model.measured_dn)))
-    return Noise(model, len(still))
-
-
-def _still_pairs(frames: Frames) -> list[Blocks]:
-    """Return the blocks of the difference of each two frames that show the same scene, pixel by
-    pixel (photon transfer).
-    """
+    # The difference of two frames that show the same scene, pixel by pixel, holds no texture
+    # (photon transfer).
     # Two frames of a still scene have one level: sorted by it, they are neighbours.
     by_level = sorted(frames.paths, key=lambda path: float(np.median(frames.read(path))))
     differences = []
@@ -100,7 +84,17 @@ def _still_pairs(frames: Frames) -> list[Blocks]:
         structure = blocks.structure / np.maximum(blocks.fine, 1e-9)
         if float(np.median(structure)) < STILL_STRUCTURE:
             differences.append(blocks)
-    return differences
+    still = [above_black(blocks, frames.black_dn) for blocks in differences]
+    model = fit_noise(join(still or frame_blocks), incomplete=True)
+    if isinstance(model, Refusal):
+        raise ImageError(
+            f"The noise of {frames.name} cannot be measured: {model.reason}. It is measured on "
+            "blurred, raw ground from dark to bright: give more raw images of plain ground, dark "
+            "and bright, neither restored nor resampled."
+        )
+    if not still and len(frame_blocks) > 1:
+        _require_one_sensor(frames, frame_blocks, math.sqrt(math.prod(model.measured_dn)))
+    return Noise(model, len(still))
 
 
 def _require_one_sensor(frames: Frames, frame_blocks: Sequence[Blocks], dn: float) -> None:

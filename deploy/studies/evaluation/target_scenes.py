@@ -133,8 +133,15 @@ def acquire_targets(sensor: Instrument, reference: Instrument, seed: int) -> Tar
     points = [
         _acquire_points(background, *sensors, next(draws)) for background in POINT_BACKGROUNDS
     ]
+    # Zone plates are cos(pi / 2 r^2 / R): r / 2R cycles per pixel at the radius r.
+    frequency = _radius_px(ZONE_PX, 1) / (2 * ZONE_NYQUIST_PX)
+    ring = (frequency >= ZONE_BAND[0]) & (frequency <= ZONE_BAND[1])
+    radius_px = _radius_px(ZONE_PX, OVERSAMPLING)
+    # The pattern ends at the radius where it reaches Nyquist, because it would alias beyond.
+    chirp = np.cos(math.pi / 2 * radius_px**2 / ZONE_NYQUIST_PX) * (radius_px < ZONE_NYQUIST_PX)
+    plates = [(f"zone plate of {share:.0%}", share * chirp, ring) for share in ZONE_CONTRASTS]
     patterns = []
-    for name, contrast, mask in (*_bars(), *_zone_plates()):
+    for name, contrast, mask in (*_bars(), *plates):
         scene = (PATTERN_BACKGROUND * (1 + contrast)).astype(np.float32)
         draw = next(draws)
         raw = _acquire(scene, sensor, draw)
@@ -214,18 +221,6 @@ def _bars() -> list[tuple[str, np.ndarray, np.ndarray]]:
         name = f"bars of {contrast:.0%}, period {period_px:.3g} px"
         bars += [(name, across, middle), (name, across.T, middle)]
     return bars
-
-
-def _zone_plates() -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """Return zone plates, cos(pi / 2 r^2 / R): r / 2R cycles per pixel at the radius r."""
-    frequency = _radius_px(ZONE_PX, 1) / (2 * ZONE_NYQUIST_PX)
-    ring = (frequency >= ZONE_BAND[0]) & (frequency <= ZONE_BAND[1])
-    radius_px = _radius_px(ZONE_PX, OVERSAMPLING)
-    # The pattern ends at the radius where it reaches Nyquist, because it would alias beyond.
-    chirp = np.cos(math.pi / 2 * radius_px**2 / ZONE_NYQUIST_PX) * (radius_px < ZONE_NYQUIST_PX)
-    return [
-        (f"zone plate of {contrast:.0%}", contrast * chirp, ring) for contrast in ZONE_CONTRASTS
-    ]
 
 
 def _places_px(side_px: int, ratio: int = OVERSAMPLING) -> np.ndarray:

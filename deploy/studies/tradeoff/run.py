@@ -326,7 +326,17 @@ def _measured(
                 scores_of[key] = benchmark.scores(point, method.restore)
             scores = scores_of[key]
             figures = benchmark.means(scores)
-            results.append(Measured(point.name, figures, _text(point, method), point, scores))
+            halo = "exact" if point.halo_px is None else str(point.halo_px)
+            text = {
+                "board": point.board.name if point.board else "this machine",
+                "configuration": point.dpu.name if point.dpu else "none",
+                "tile": str(point.tile_px) if point.dpu else "none",
+                "halo": halo if point.dpu else "none",
+                "method": point.variant.method,
+                "precision": point.variant.precision,
+                "sensor": method.sensor_known,
+            }
+            results.append(Measured(point.name, figures, text, point, scores))
             bar.advance(1, point.name)
         host = measure_host(methods, benchmark)
         bar.advance(1, "timed on this machine")
@@ -353,19 +363,6 @@ def _methods(points: Sequence[Point], benchmark: Benchmark) -> dict[Variant, Met
         if variant.network
         else method_named(variant.method, *sensors)
         for variant in dict.fromkeys(point.variant for point in points)
-    }
-
-
-def _text(point: Point, method: Method) -> dict[str, str]:
-    halo = "exact" if point.halo_px is None else str(point.halo_px)
-    return {
-        "board": point.board.name if point.board else "this machine",
-        "configuration": point.dpu.name if point.dpu else "none",
-        "tile": str(point.tile_px) if point.dpu else "none",
-        "halo": halo if point.dpu else "none",
-        "method": point.variant.method,
-        "precision": point.variant.precision,
-        "sensor": method.sensor_known,
     }
 
 
