@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 
 from beers_deploy.model.family import SensorFamily
-from beers_deploy.model.io.files import sha256, whole_file
+from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.processor import processor_name
 from beers_deploy.model.raster.images import list_images, site_of
 from beers_deploy.model.shipped import INT8, SENSOR, shipped_weights
@@ -74,8 +74,7 @@ def make_network(
     int8 = out / f"{name}{INT8}.onnx"
     save_onnx(family_model(Conditioned(name, finished), images), int8)
     card = out / f"{name}.md"
-    with whole_file(card) as temporary:
-        temporary.write_text(model_card(label, recipe, toml, images), encoding="utf-8")
+    write_text(card, model_card(label, recipe, toml, images))
     for file in (finished, int8, card):
         logger.info("wrote %s", file)
 

@@ -128,18 +128,26 @@ def block_means(image: Image, block_px: int = BLOCK_PX) -> Image:
     return weighted_sums(weighted_sums(image, mean, 0, block_px), mean, 1, block_px)
 
 
-def reached_blocks(flags: Image, reach_px: int) -> Image:
-    """Return 1 for each block within `reach_px` of a flag, else 0.
+def free_blocks(
+    flags: NDArray[np.bool_],
+    sides: tuple[Placed, Placed],
+    origin: tuple[int, int],
+    reach_px: int,
+) -> Image:
+    """Return 1 for each block of a window without a flag within `reach_px` of it, else 0.
 
     Args:
-        flags: 0 or 1 for each pixel of the blocks, and of `reach_px` more on every side.
+        flags: bool (h, w) of a part of the image.
+        sides: the positions of its rows and its columns in the image.
+        origin: row and column in the image of its first pixel.
         reach_px: distance along rows and columns.
     """
-    ones = np.ones(BLOCK_PX + 2 * reach_px, np.float32)
+    around = extend(flags.astype(np.float32), sides, origin, reach_px)
     if not flags.any():
-        shape = tuple((side - 2 * reach_px) // BLOCK_PX for side in flags.shape)
-        return np.zeros(shape, np.float32)
-    return np.asarray(weighted_sums(weighted_sums(flags, ones, 0), ones, 1) > 0, np.float32)
+        shape = tuple((side - 2 * reach_px) // BLOCK_PX for side in around.shape)
+        return np.ones(shape, np.float32)
+    ones = np.ones(BLOCK_PX + 2 * reach_px, np.float32)
+    return np.asarray(weighted_sums(weighted_sums(around, ones, 0), ones, 1) == 0, np.float32)
 
 
 def interpolate(blocks: Image, down: Placed, across: Placed, block_px: int = BLOCK_PX) -> Image:

@@ -43,8 +43,8 @@ from beers_deploy.model.consistency.blocks import (
     Placed,
     block_means,
     extend,
+    free_blocks,
     interpolate,
-    reached_blocks,
 )
 from beers_deploy.model.consistency.detail import (
     FINE_PX,
@@ -227,13 +227,9 @@ class Consistency:
         # A mean below the least that is possible counts as no light.
         excess = np.minimum(excess, np.maximum(raw_means, np.float32(0)))
         residual = raw_means - excess - blurred
-        saturated = (raw >= self.full_scale).astype(np.float32)
-        weights = np.float32(1) - reached_blocks(
-            extend(saturated, (down, across), raw_at, NEAR_PX), NEAR_PX
-        )
+        weights = free_blocks(raw >= self.full_scale, (down, across), raw_at, NEAR_PX)
         if any_missing:
-            missing_pixels = extend(missing.astype(np.float32), (down, across), origin, NEAR_PX)
-            weights *= np.float32(1) - reached_blocks(missing_pixels, NEAR_PX)
+            weights *= free_blocks(missing, (down, across), origin, NEAR_PX)
         share: Image | None = None
         if weights.all():
             change = interpolate(residual, down, across)
