@@ -132,16 +132,6 @@ class Dpu:
         """
         return self.constants["peak_tops"].low * 1e12
 
-    @property
-    def lane_steps_per_s(self) -> float:
-        """The number of values a second that the element-wise engine of a batch handler reads.
-
-        This engine in programmable logic computes additions, pools and depthwise convolutions.
-        """
-        channels = self.value("elementwise", "channels_per_cycle")
-        lanes = channels * self.value("elementwise", "pixels_per_cycle")
-        return lanes * self.value("array", "pl_clock_hz")
-
     def limit(self, table: str, key: str) -> Constant:
         """Return a constant of the board or the configuration, with its source.
 

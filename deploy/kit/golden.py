@@ -95,6 +95,11 @@ def write_golden(
         if case in images:
             save_array(folder / case / PICTURE, images[case])
     network.save(folder / NETWORK)
+    facts: dict[str, dict[str, object]] = {
+        op.output: {"layer": op.name, "operator": type(op).__name__, "reads": list(op.inputs)}
+        for op in core.ops
+    }
+    facts[PLANES] = {"layer": "the planes that the core reads", "operator": "", "reads": []}
     index = {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
@@ -102,7 +107,10 @@ def write_golden(
         "cases": digests,
         "network": network.input._asdict(),
         "half_even": half_even,
-        "layers": _layers(core, names),
+        "layers": [
+            {"file": file, "tensor": name, **facts[name], "fractional_bits": core.frac_bits[name]}
+            for name, file in names.items()
+        ],
     }
     write_text(folder / INDEX, json.dumps(index, indent=1) + "\n")
     return folder
@@ -150,18 +158,6 @@ def files_of(core: IntCore) -> dict[str, str]:
         name: f"{k:02d}-{re.sub(r'[^A-Za-z0-9._-]+', '_', name)}.npy"
         for k, name in enumerate(tensors)
     }
-
-
-def _layers(core: IntCore, names: Mapping[str, str]) -> list[dict[str, object]]:
-    facts: dict[str, dict[str, object]] = {
-        op.output: {"layer": op.name, "operator": type(op).__name__, "reads": list(op.inputs)}
-        for op in core.ops
-    }
-    facts[PLANES] = {"layer": "the planes that the core reads", "operator": "", "reads": []}
-    return [
-        {"file": file, "tensor": name, **facts[name], "fractional_bits": core.frac_bits[name]}
-        for name, file in names.items()
-    ]
 
 
 EXTREMES = "extremes"

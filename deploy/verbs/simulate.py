@@ -139,7 +139,14 @@ def simulate(
 
         aim = degraded.reference if reference is None else Sensor.load(reference)
         ratio = _whole(oversampling or int(degraded.oversampling.low))
-        return simulated_pair(_one(images), degraded, aim, size, scale, ratio, seed)
+        several = images if isinstance(images, list | tuple) else [images]
+        if len(several) > 1:
+            raise OptionError(
+                f"`images` must be one scene without `out`, got {len(several)}. Add `out` to write "
+                "a data set."
+            )
+        one = several[0] if several else None
+        return simulated_pair(one, degraded, aim, size, scale, ratio, seed)
     recipe = _recipe(
         _files(images), degraded, reference, oversampling, patch or patch_px, scale, seed, tolerance
     )
@@ -156,17 +163,6 @@ def _whole(oversampling: float) -> int:
             "add `out` to write a data set."
         )
     return int(oversampling)
-
-
-def _one(images: Images | None) -> object:
-    """Return the one scene of a pair: a path, pixels, or None for a drawn one."""
-    several = images if isinstance(images, list | tuple) else [images]
-    if len(several) > 1:
-        raise OptionError(
-            f"`images` must be one scene without `out`, got {len(several)}. Add `out` to write a "
-            "data set."
-        )
-    return several[0] if several else None
 
 
 def _files(images: Images | None) -> list[Path | None]:

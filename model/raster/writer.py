@@ -90,7 +90,17 @@ def write_raster(
     with disk_errors(path), gdal(GDAL_CACHEMAX=LEAST_CACHE_BYTES, GDAL_TIFF_INTERNAL_MASK="YES"):
         with rasterio.open(path, "w", **_profile(raster, compression)) as file:
             file.update_tags(TIFFTAG_SOFTWARE=software, **dict(raster.tags))
-            _describe(file, raster)
+            if raster.place.area_or_point:
+                file.update_tags(AREA_OR_POINT=raster.place.area_or_point)
+            if raster.place.rpcs:
+                file.update_tags(ns="RPC", **dict(raster.place.rpcs))
+            if raster.mask_kind == "alpha":
+                # The creation option ALPHA would mark the first band after grey or blue.
+                grey = [ColorInterp.gray, *[ColorInterp.undefined] * raster.bands]
+                light = RGB if raster.colour else grey
+                file.colorinterp = [*light[: raster.bands], ColorInterp.alpha]
+            if raster.band_info:
+                _describe_bands(file, raster.band_info)
             for plane, window, rows in _planes(raster, pixels):
                 if plane == MASK:
                     file.write_mask(rows, window=window)
@@ -193,21 +203,6 @@ def _profile(raster: Raster, compression: Compression) -> dict[str, Any]:
     elif place.transform is not None:
         profile["transform"] = place.transform
     return profile
-
-
-def _describe(file: Any, raster: Raster) -> None:
-    """Write the place and the properties of the bands into an open TIFF."""
-    if raster.place.area_or_point:
-        file.update_tags(AREA_OR_POINT=raster.place.area_or_point)
-    if raster.place.rpcs:
-        file.update_tags(ns="RPC", **dict(raster.place.rpcs))
-    if raster.mask_kind == "alpha":
-        # The creation option ALPHA would mark the first band after grey or blue.
-        grey = [ColorInterp.gray, *[ColorInterp.undefined] * raster.bands]
-        light = RGB if raster.colour else grey
-        file.colorinterp = [*light[: raster.bands], ColorInterp.alpha]
-    if raster.band_info:
-        _describe_bands(file, raster.band_info)
 
 
 def _describe_bands(file: Any, bands: Sequence[BandInfo]) -> None:

@@ -258,16 +258,20 @@ class StoredPairs:
         while True:
             # Keyed by the batch's number and not drawn in sequence: a resumed run draws the same.
             generator = Draw(self.seed, number * self.workers + self.rank).generator("stored")
-            patches = torch.stack([self._patch(generator) for _ in range(self.batch)]) / self.max_dn
+            pairs = []
+            for _ in range(self.batch):
+                # One patch (2, P, P) at a random place of a random pair.
+                files = self.files[int(generator.integers(len(self.files)))]
+                images = [
+                    read_acquisition(file, remedy=RESCALE, max_dn=self.max_dn) for file in files
+                ]
+                top, left = (
+                    int(generator.integers(px - self.patch_px + 1)) for px in images[0].shape
+                )
+                window = slice(top, top + self.patch_px), slice(left, left + self.patch_px)
+                both = np.stack([np.float32(image[window]) for image in images])
+                turned = turn(both, generator, self.quarters, self.mirrors)
+                pairs.append(torch.from_numpy(np.ascontiguousarray(turned)))
+            patches = torch.stack(pairs) / self.max_dn
             yield Batch(patches[:, :1].contiguous(), patches[:, 1:].contiguous())
             number += 1
-
-    def _patch(self, generator: np.random.Generator) -> Tensor:
-        """Read one patch (2, P, P) at a random place of a random pair."""
-        files = self.files[int(generator.integers(len(self.files)))]
-        images = [read_acquisition(file, remedy=RESCALE, max_dn=self.max_dn) for file in files]
-        top, left = (int(generator.integers(px - self.patch_px + 1)) for px in images[0].shape)
-        window = slice(top, top + self.patch_px), slice(left, left + self.patch_px)
-        both = np.stack([np.float32(image[window]) for image in images])
-        patches = turn(both, generator, self.quarters, self.mirrors)
-        return torch.from_numpy(np.ascontiguousarray(patches))

@@ -138,8 +138,11 @@ class Layers:
     def of(cls, works: Sequence[Work], dpu: Dpu) -> Self:
         """Collect the layers of one network, all of which run on `dpu`."""
         array = dpu.engine_ops_per_s
-        lanes = dpu.lane_steps_per_s
         clock_hz = dpu.value("array", "pl_clock_hz")
+        # The element-wise engine in programmable logic computes additions, pools and depthwise
+        # convolutions.
+        channels = dpu.value("elementwise", "channels_per_cycle")
+        lanes = channels * dpu.value("elementwise", "pixels_per_cycle") * clock_hz
         memory = dpu.limit("memory", "ddr_bytes_per_s").high
         board = (clock_hz, memory, dpu.handlers, dpu.cores)
         rows = [
