@@ -63,11 +63,12 @@ def network_method(
     network = ExposedNetwork({1: infer, **at_first_call}, tiling.halo_px, offset)
     consistency = (Consistency.of(sensor, reference, max_dn),) if sensor and reference else ()
 
-    def default_plan(shape: tuple[int, ...]) -> Plan:
-        return make_plan((1, *shape), tiling.fixed_px or TILE_PX, tiling.halo_px, tiling)
-
     def restore(dn: np.ndarray) -> np.ndarray:
-        plan = (plan_of or default_plan)(dn.shape)
+        if plan_of is None:
+            tile_px = tiling.fixed_px or TILE_PX
+            plan = make_plan((1, *dn.shape), tile_px, tiling.halo_px, tiling)
+        else:
+            plan = plan_of(dn.shape)
         return np.asarray(np.rint(restore_floats(dn, network, plan, max_dn, consistency)))
 
     return restore

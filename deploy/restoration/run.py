@@ -32,7 +32,7 @@ from beers_deploy.restoration.bands import in_order
 from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.cluster import open_cluster
 from beers_deploy.restoration.detectors.fault_list import FOUND, FaultList, found_list_path
-from beers_deploy.restoration.detectors.fix import faults_of, fixed
+from beers_deploy.restoration.detectors.fix import FixedSource, faults_of
 from beers_deploy.restoration.interval import (
     HalfWidths,
     half_widths_of,
@@ -111,7 +111,8 @@ def restore_file(
         if stored.raster.mask_kind == "alpha":
             logger.info(ALPHA.format(band=stored.raster.bands + 1))
         faults = faults_of(stored, reading.fix_detectors, str(image))
-        work = pipeline.prepare(fixed(stored, faults), reading, str(image), cluster)
+        read_from = FixedSource(stored, faults) if faults.faults else stored
+        work = pipeline.prepare(read_from, reading, str(image), cluster)
         checks = checks_of(reading.sensors, stored.raster, work.out_shape, work.scale.value)
         if output.self_check is not None and not checks:
             raise OptionError(

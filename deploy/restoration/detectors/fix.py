@@ -115,16 +115,6 @@ def require_neighbours(faults: FaultList, raster: Raster) -> None:
             )
 
 
-def fixed(source: Source, faults: FaultList) -> Source:
-    """Return the image as it is read with its faulty pixels replaced, or the image itself.
-
-    Args:
-        source: the image.
-        faults: the faults to replace; if the list is empty, `source` is returned.
-    """
-    return FixedSource(source, faults) if faults.faults else source
-
-
 def find_faults(source: Source, name: str) -> FaultList:
     """Detect the faulty pixels, columns and rows of an image.
 

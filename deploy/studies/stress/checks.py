@@ -48,11 +48,6 @@ def not_finite(pixels: np.ndarray) -> Measure:
     return Measure("not finite", float((~np.isfinite(pixels)).sum()), 0, "px")
 
 
-def out_of_range(image: np.ndarray) -> Measure:
-    """Count the known pixels of an image (H, W) that lie outside 0 to 4095 DN."""
-    return Measure("out of range", float(((image < 0) | (image > FULL_DN)).sum()), 0, "px")
-
-
 def differing(check: str, image: np.ndarray, other: np.ndarray) -> Measure:
     """Count the pixels of two images (H, W) that differ in any bit, as the check named `check`. NaN
     equals NaN.
