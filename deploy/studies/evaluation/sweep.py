@@ -139,7 +139,17 @@ def run_sweep(
     candidates = [method_named(name, profile, reference) for name in (DEGRADED, TRADITIONAL)]
     candidates += [method for method in methods if method.name not in WITHOUT_NETWORK]
     sensors = conditions(nominal, profile)
-    trials = {name: _trials(name, sensor, candidates, profile) for name, sensor in sensors.items()}
+    able = [method for method in candidates if method.specialise is not None]
+    wrongly = suppositions(nominal, profile)
+    trials = dict[str, list[tuple[str, Instrument, Method]]]()
+    for name, sensor in sensors.items():
+        trials[name] = [(name, sensor, method) for method in candidates]
+        # Under the nominal condition this trial of the pipeline is the plain one.
+        if name != NOMINAL:
+            units = replace(nominal, gain_dn_per_radiance=sensor.gain_dn_per_radiance)
+            trials[name].append((NOMINAL, units, candidates[1]))
+        others = wrongly.get(name, {}).items()
+        trials[name] += [(*known, method) for known, method in product(others, able)]
     with steps("sweep", sum(map(len, trials.values()))) as bar:
         for name, sensor in sensors.items():
             pairs, _ = simulate_pairs(
@@ -155,22 +165,6 @@ def run_sweep(
                     mtf[key] = restored_mtf(specialised, edges, sensor.max_dn)
                 bar.advance(1, f"{name}: {method.name}")
     return SweepResult(psnr, mtf, [pair.site for pair in pairs], seed, brightness)
-
-
-def _trials(
-    name: str, sensor: Instrument, methods: Sequence[Method], profile: Sensor
-) -> list[tuple[str, Instrument, Method]]:
-    """Return name, sensor and method for each assumed sensor. The second of `methods` is the
-    pipeline.
-    """
-    nominal = profile.nominal()
-    units = replace(nominal, gain_dn_per_radiance=sensor.gain_dn_per_radiance)
-    # Under the nominal condition this trial is the plain one.
-    drifted = [] if name == NOMINAL else [(NOMINAL, units, methods[1])]
-    able = [method for method in methods if method.specialise is not None]
-    supposed = suppositions(nominal, profile).get(name, {})
-    wrong = [(other, sensor, method) for (other, sensor), method in product(supposed.items(), able)]
-    return [*((name, sensor, method) for method in methods), *drifted, *wrong]
 
 
 def _psnr_db(method: Method, pairs: Sequence[NamedPair], max_dn: int) -> np.ndarray:
