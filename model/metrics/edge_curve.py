@@ -151,7 +151,7 @@ def measure_curve(edges: Sequence[Edge], generator: np.random.Generator) -> MtfC
         return Refusal("no straight edge")
     if mtf_at(SHARP_CPX, weights) > SHARPEST * np.sinc(SHARP_CPX):
         return Refusal("sharper than a detector's pixel: sharpened, or more than one edge in a box")
-    values, errors = _softness(fitted, weights)
+    values, errors = softness(fitted, weights)
     draws = _drawn(fitted, weights, generator)
     # Edges whose softness is not the others'; of two that differ, both.
     off = np.abs(values - float(np.median(values)))
@@ -200,7 +200,7 @@ def _curve_of_sharpest(
             break
         weights = _solved(sharp, weights)
         fitted = _fitted_again(fitted, weights)
-        values, errors = _softness(fitted, weights)
+        values, errors = softness(fitted, weights)
         precise = errors <= MAX_ERROR_PX
         # Texture scatters the softness by more than the noise that its own error counts.
         errors = np.hypot(errors, [UNEVEN_PX * edge.unevenness for edge in fitted])
@@ -241,12 +241,6 @@ def _solved(edges: Sequence[FittedEdge], weights: np.ndarray) -> np.ndarray:
     gram = np.sum(grams, axis=0)
     moment = np.sum(moments, axis=0)
     return solve(gram, moment, weights, likeliest_bend(gram, moment, weights))
-
-
-def _softness(edges: Sequence[FittedEdge], weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return softness beyond the curve, and its standard error, (N,) each."""
-    pairs = np.array([softness(edge, weights) for edge in edges]).reshape(-1, 2)
-    return pairs[:, 0], pairs[:, 1]
 
 
 def sharpest(values: np.ndarray, errors: np.ndarray) -> float:

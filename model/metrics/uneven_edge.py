@@ -12,6 +12,7 @@ equations.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -251,26 +252,31 @@ def strips_of(edge: FittedEdge) -> int:
     return max(int(edge.pixels.values.shape[0]) // STRIP_PX, 2)
 
 
-def softness(edge: FittedEdge, weights: np.ndarray) -> tuple[float, float]:
-    """Estimate by how much an edge is softer than an MTF curve, and the standard error.
+def softness(edges: Sequence[FittedEdge], weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Estimate by how much edges are softer than an MTF curve, and the standard errors.
 
     The softness is s in pixels of a further factor exp(-s f). Its error is the larger of two: that
     from noise and texture, and that from the differences between the strips along the edge.
 
     Args:
-        edge: the edge, fitted to the curve of `weights`.
+        edges: the N edges, fitted to the curve of `weights`.
         weights: (PARTS,) of the curve, as in `mtf_basis`.
 
     Returns:
-        The softness and its standard error, both in pixels.
+        The softness of each edge and its standard error, (N,) each, both in pixels.
     """
-    by_softness = edge.curve @ (softened(weights, SOFTER_PX) - weights) / SOFTER_PX
-    basis, _ = np.linalg.qr(edge.normal)
-    by_softness = by_softness - basis @ (basis.T @ by_softness)
-    residuals = edge.rest - basis @ (basis.T @ edge.rest)
-    size = float(by_softness @ by_softness)
-    value = float(by_softness @ residuals) / size
-    contributions = (by_softness * (residuals - value * by_softness))[: edge.strip.size]
-    # Texture is alike over some pixels along the edge: strips are independent, pixels are not.
-    by_strip = np.bincount(edge.strip - edge.strip.min(), weights=contributions)
-    return value, max(size**-0.5, math.sqrt(float((by_strip**2).sum())) / size)
+    values = []
+    errors = []
+    for edge in edges:
+        by_softness = edge.curve @ (softened(weights, SOFTER_PX) - weights) / SOFTER_PX
+        basis, _ = np.linalg.qr(edge.normal)
+        by_softness = by_softness - basis @ (basis.T @ by_softness)
+        residuals = edge.rest - basis @ (basis.T @ edge.rest)
+        size = float(by_softness @ by_softness)
+        value = float(by_softness @ residuals) / size
+        contributions = (by_softness * (residuals - value * by_softness))[: edge.strip.size]
+        # Texture is alike over some pixels along the edge: strips are independent, pixels are not.
+        by_strip = np.bincount(edge.strip - edge.strip.min(), weights=contributions)
+        values.append(value)
+        errors.append(max(size**-0.5, math.sqrt(float((by_strip**2).sum())) / size))
+    return np.array(values), np.array(errors)

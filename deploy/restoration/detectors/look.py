@@ -229,31 +229,30 @@ def sentences(bands: Sequence[BandFaults], advise_fix: bool = True) -> list[str]
     messages = []
     for number, band in enumerate(bands, 1):
         where = f"band {number}: " if len(bands) > 1 else ""
-        messages += [
-            f"look at the detectors: {where}{words}" for words in _of_band(band, advise_fix)
+        words = [
+            *_of_lines("column", band.columns, advise_fix),
+            *_of_lines("row", band.rows, advise_fix),
         ]
+        for pattern in band.patterns:
+            if not pattern.significant:
+                continue
+            shape = "a checkerboard" if pattern.name == "checkerboard" else pattern.name
+            size = f"{pattern.difference:.2%} rms of the level, {pattern.largest:.2%} at most"
+            advice = f"; {SHARPENS}: {EQUALIZE}, channel by channel"
+            if pattern.largest > COLOUR:
+                advice = (
+                    ", as of a mosaic of colour filters: split the image into its colours first"
+                )
+            words.append(f"a fixed pattern of two pixels, {shape}: {size}{advice}")
+        if len(band.pixels):
+            places = [f"column {column}, row {row}" for row, column in band.pixels.tolist()]
+            words.append(
+                f"{counted(len(places), 'pixel')} of {band.looked_px}, isolated as no light can "
+                f"be: hot, dead or hit by a particle ({_some(places)}); restoration sharpens that"
+                f"{FIX + 'pixels' if advise_fix else ''}"
+            )
+        messages += [f"look at the detectors: {where}{text}" for text in words]
     return messages
-
-
-def _of_band(band: BandFaults, advise_fix: bool) -> Iterator[str]:
-    yield from _of_lines("column", band.columns, advise_fix)
-    yield from _of_lines("row", band.rows, advise_fix)
-    for pattern in band.patterns:
-        if not pattern.significant:
-            continue
-        shape = "a checkerboard" if pattern.name == "checkerboard" else pattern.name
-        size = f"{pattern.difference:.2%} rms of the level, {pattern.largest:.2%} at most"
-        advice = f"; {SHARPENS}: {EQUALIZE}, channel by channel"
-        if pattern.largest > COLOUR:
-            advice = ", as of a mosaic of colour filters: split the image into its colours first"
-        yield f"a fixed pattern of two pixels, {shape}: {size}{advice}"
-    if len(band.pixels):
-        places = [f"column {column}, row {row}" for row, column in band.pixels.tolist()]
-        yield (
-            f"{counted(len(places), 'pixel')} of {band.looked_px}, isolated as no light can be: "
-            f"hot, dead or hit by a particle ({_some(places)}); restoration sharpens that"
-            f"{FIX + 'pixels' if advise_fix else ''}"
-        )
 
 
 def _of_lines(one: str, lines: Stripes, advise_fix: bool) -> Iterator[str]:
