@@ -1,15 +1,19 @@
-"""Functions that add nodes between two convolutions, and list the rules that the network breaks."""
+"""Functions that add nodes between two convolutions, place networks on a DPU, and list the rules
+that they break.
+"""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from unittest.mock import patch
 
 import numpy as np
+import onnx
 
 from beers_deploy.dpu.board import Dpu, load_dpu
-from beers_deploy.dpu.checker.placement import PlacedNode, place
+from beers_deploy.dpu.checker.placement import PlacedNode, Placement, place
 from beers_deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import Sketch, Value
 
@@ -25,9 +29,21 @@ def as_written() -> Iterator[None]:
         yield
 
 
-def broken_rules(path: Path, dpu: Dpu = DPU, tile_px: int = TILE_PX) -> list[str]:
-    """Return the names of the rules that the nodes of a file break."""
-    return rules_of(place(read_network(path, tile_px), dpu).nodes)
+def placed_file(path: Path, tile_px: int = TILE_PX, dpu: Dpu = DPU) -> Placement:
+    """Read a file, and place its nodes on a DPU."""
+    return place(read_network(path, tile_px), dpu)
+
+
+def placed(model: onnx.ModelProto, tile_px: int = TILE_PX, dpu: Dpu = DPU) -> Placement:
+    """Write a network to a file, read it, and place its nodes on a DPU."""
+    with TemporaryDirectory() as folder:
+        onnx.save_model(model, Path(folder) / "network.onnx")
+        return placed_file(Path(folder) / "network.onnx", tile_px, dpu)
+
+
+def broken_rules(model: onnx.ModelProto, tile_px: int = TILE_PX, dpu: Dpu = DPU) -> list[str]:
+    """Return the names of the rules that the nodes of a network break."""
+    return rules_of(placed(model, tile_px, dpu).nodes)
 
 
 def rules_of(nodes: Iterable[PlacedNode]) -> list[str]:
@@ -36,13 +52,12 @@ def rules_of(nodes: Iterable[PlacedNode]) -> list[str]:
     return [violation.rule for violation in violations]
 
 
-def between_convs(tmp_path: Path, draw: Draw, dpu: Dpu = DPU, channels: int = 8) -> list[str]:
+def between_convs(draw: Draw, dpu: Dpu = DPU, channels: int = 8) -> list[str]:
     """Return the rules that a network with `draw` between two convolutions breaks."""
     sketch = Sketch(channels)
     middle = draw(sketch, sketch.conv("image", (channels, channels, 1, 1)))
     result = sketch.node("AveragePool", middle, kernel_shape=[1, 1])
-    end = sketch.conv(result, (1, channels, 1, 1))
-    return broken_rules(sketch.save(tmp_path / "net.onnx", end), dpu)
+    return broken_rules(sketch.model(sketch.conv(result, (1, channels, 1, 1))), dpu=dpu)
 
 
 def conv(*weight: int, **attributes: Value) -> Draw:

@@ -41,14 +41,17 @@ class Sketch:
         padded: Mapping[str, Value] = {"pads": [weight[2] // 2, weight[3] // 2] * 2, **attributes}
         return self.node("Conv", source, self.weight(*weight), **padded)
 
-    def save(self, path: Path, *results: str) -> Path:
+    def model(self, *results: str) -> onnx.ModelProto:
         ends = [
             helper.make_tensor_value_info(r, TensorProto.FLOAT, ["N", "C", "H2", "W2"])
             for r in results
         ]
         graph = helper.make_graph(self.nodes, "sketch", [self.input], ends, self.constants)
         opsets = [helper.make_opsetid("", 17), helper.make_opsetid("com.microsoft", 1)]
-        onnx.save_model(helper.make_model(graph, opset_imports=opsets, ir_version=8), path)
+        return helper.make_model(graph, opset_imports=opsets, ir_version=8)
+
+    def save(self, path: Path, *results: str) -> Path:
+        onnx.save_model(self.model(*results), path)
         return path
 
 
@@ -183,7 +186,7 @@ class QdqSketch(Sketch):
         return self.pair(self.node("Conv", source, kernel, start, pads=[1] * 4), output)
 
 
-def behind_qdq_conv(path: Path, draw: Callable[[QdqSketch, str], str]) -> Path:
-    """Write a network with `draw` behind a convolution."""
+def behind_qdq_conv(draw: Callable[[QdqSketch, str], str]) -> onnx.ModelProto:
+    """Build a network with `draw` behind a convolution."""
     sketch = QdqSketch(4)
-    return sketch.save(path, draw(sketch, sketch.qdq_conv(sketch.pair("image"))))
+    return sketch.model(draw(sketch, sketch.qdq_conv(sketch.pair("image"))))

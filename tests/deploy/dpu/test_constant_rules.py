@@ -3,7 +3,6 @@ is read in the format in which it was written.
 """
 
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import onnx
@@ -13,22 +12,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import numpy_helper
 
-from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker import number_rules
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.graph import Operation
-from beers_deploy.dpu.reading import network_of, read_network
+from beers_deploy.dpu.reading import network_of
 from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.encodings import board_model
 from beers_deploy.quant.graph.quantized import Scale
 from beers_deploy.quant.quantize import Quantized, quantize_model
-from tests.deploy.dpu.draws import rules_of
+from tests.deploy.dpu.draws import DPU, placed, rules_of
 from tests.deploy.dpu.graphs import IntegerSketch
 from tests.model.networks import plain
 from tests.quant.quick import copied, drawn
 
-DPU = load_dpu("vck190")
 HALF = Scale((0.5,), (0,), "int8")
 
 
@@ -83,13 +80,11 @@ def test_a_bias_passes_where_some_shift_makes_it_int8(values: list[int], shift: 
         ([64 << 17, 0, 0, 0], {"int32 bias"}),
     ],
 )
-def test_the_bias_of_an_integer_kernel_is_checked(
-    tmp_path: Path, bias: list[int], expected: set[str]
-) -> None:
+def test_the_bias_of_an_integer_kernel_is_checked(bias: list[int], expected: set[str]) -> None:
     s = IntegerSketch()
     inner = s.qconv(s.quantized("image"), (4, 1, 3, 3), bias=np.array(bias, np.int32))
-    path = s.save(tmp_path / "b.onnx", s.node("DequantizeLinear", inner, *s.numbers))
-    nodes = place(read_network(path, 20), DPU).failed
+    model = s.model(s.node("DequantizeLinear", inner, *s.numbers))
+    nodes = placed(model, 20).failed
     assert set(rules_of(nodes)) == expected
     assert all("beers-deploy quantize" in node.broken[0].finding.remedy for node in nodes)
 

@@ -5,17 +5,15 @@ import numpy as np
 import pytest
 
 from beers_deploy.dpu.board import load_dpu
-from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.host import placed_work
 from beers_deploy.dpu.cost.latency import WIDTHS
 from beers_deploy.dpu.cost.model import PARTS, frame_rate, shares_of
 from beers_deploy.dpu.cost.work import BURST_BYTES, Work, count_work
-from beers_deploy.dpu.reading import read_network
 from beers_deploy.performance.swath import predict_network
 from beers_deploy.profiles.errors import ModelError
+from tests.deploy.dpu.draws import DPU, placed
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 
-DPU = load_dpu("vck190")
 PAPER_FPS = 7.2
 
 
@@ -72,9 +70,9 @@ def test_unused_rows_columns_and_channels_of_the_array_take_time_too(
     assert wide.array_use == 2 * 9 * 40**2 * 97**2 / wide.array_operations
 
 
-def works_of(sketch: Sketch, result: str, path: Path, side_px: int) -> tuple[Work, ...]:
+def works_of(sketch: Sketch, result: str, side_px: int) -> tuple[Work, ...]:
     """Return the work of each layer of a network that ends in `result`."""
-    return count_work(place(read_network(sketch.save(path, result), side_px), DPU).core, DPU)
+    return count_work(placed(sketch.model(result), side_px).core, DPU)
 
 
 def moved(works: tuple[Work, ...]) -> int:
@@ -82,7 +80,7 @@ def moved(works: tuple[Work, ...]) -> int:
     return sum(work.map_bytes for work in works)
 
 
-def test_the_input_of_three_branches_passes_through_memory(tmp_path: Path) -> None:
+def test_the_input_of_three_branches_passes_through_memory() -> None:
     """Three branches load their stored input three times. The input of two stays on the chip."""
     maps = {}
     burst = BURST_BYTES / 16
@@ -90,7 +88,7 @@ def test_the_input_of_three_branches_passes_through_memory(tmp_path: Path) -> No
         s = Sketch(16)
         stem = s.conv("image", (16, 16, 3, 3))
         joined = s.node("Concat", *(s.conv(stem, (16, 16, 1, 1)) for _ in range(branches)), axis=1)
-        works = works_of(s, s.conv(joined, (8, 16 * branches, 1, 1)), tmp_path / "n.onnx", 32)
+        works = works_of(s, s.conv(joined, (8, 16 * branches, 1, 1)), 32)
         maps[branches] = moved(works) / (16 * 32 * 32)
     image = 1
     result = 0.5
@@ -99,11 +97,11 @@ def test_the_input_of_three_branches_passes_through_memory(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("channels", [(16, 48), (64, 100), (200, 3)])
 def test_the_inputs_of_a_concat_are_stored_in_bursts_and_loaded_again(
-    tmp_path: Path, channels: tuple[int, int]
+    channels: tuple[int, int],
 ) -> None:
     s = Sketch(8)
     joined = s.node("Concat", *(s.conv("image", (count, 8, 3, 3)) for count in channels), axis=1)
-    works = works_of(s, s.conv(joined, (8, sum(channels), 1, 1)), tmp_path / "n.onnx", 33)
+    works = works_of(s, s.conv(joined, (8, sum(channels), 1, 1)), 33)
     padded_channels = [BURST_BYTES * math.ceil(count / BURST_BYTES) for count in channels]
     assert [work.store_map_bytes for work in works] == [
         33 * 33 * count for count in (*padded_channels, 0, 8)
@@ -113,9 +111,7 @@ def test_the_inputs_of_a_concat_are_stored_in_bursts_and_loaded_again(
 
 @pytest.mark.parametrize(("side", "maps"), [(97, 0), (257, 1)])
 @pytest.mark.parametrize("convs", [1, 2])
-def test_an_add_of_maps_beyond_the_chip_loads_one_of_them(
-    tmp_path: Path, side: int, maps: int, convs: int
-) -> None:
+def test_an_add_of_maps_beyond_the_chip_loads_one_of_them(side: int, maps: int, convs: int) -> None:
     """The other map comes from the operation before. Maps that fit on the chip are not moved."""
     sums = []
     wide = (32, 32, 3, 3)
@@ -125,7 +121,7 @@ def test_an_add_of_maps_beyond_the_chip_loads_one_of_them(
         for _ in range(convs):
             x = s.conv(x, wide)
         last = s.conv(s.node("Add", x, first) if added else x, (8, 32, 1, 1))
-        sums.append(moved(works_of(s, last, tmp_path / "n.onnx", side)))
+        sums.append(moved(works_of(s, last, side)))
     assert sums[1] - sums[0] == maps * 32 * side * side
 
 
@@ -142,13 +138,13 @@ def test_the_load_of_an_add_is_not_hidden(tmp_path: Path, board: str) -> None:
 
 
 @pytest.mark.parametrize("block", [2, 4])
-def test_a_pixel_shuffle_costs_the_bursts_of_its_pieces(tmp_path: Path, block: int) -> None:
+def test_a_pixel_shuffle_costs_the_bursts_of_its_pieces(block: int) -> None:
     """The three channels of each pixel take a burst. The host shuffles at the network's end."""
     map_bytes = {}
     for place_in, ends in (("end", True), ("middle", False)):
         s = Sketch(3)
         x = s.node("DepthToSpace", s.conv("image", (3 * block**2, 3, 3, 3)), blocksize=block)
-        works = works_of(s, x if ends else s.conv(x, (3, 3, 1, 1)), tmp_path / "n.onnx", 512)
+        works = works_of(s, x if ends else s.conv(x, (3, 3, 1, 1)), 512)
         assert len(works) == (1 if ends else 2)
         map_bytes[place_in] = works[0].store_map_bytes
     values = 3 * block**2 * 512 * 512
@@ -157,7 +153,7 @@ def test_a_pixel_shuffle_costs_the_bursts_of_its_pieces(tmp_path: Path, block: i
 
 @pytest.mark.parametrize(("kernel", "stride", "taps"), [(2, 2, 1), (3, 2, 2), (4, 2, 2), (9, 3, 3)])
 def test_a_transposed_convolution_runs_as_one_convolution_for_each_phase(
-    tmp_path: Path, kernel: int, stride: int, taps: int
+    kernel: int, stride: int, taps: int
 ) -> None:
     """Each phase has every s-th tap, padded, and as many output pixels as the image has.
 
@@ -168,10 +164,10 @@ def test_a_transposed_convolution_runs_as_one_convolution_for_each_phase(
     window = {"strides": [stride] * 2, "pads": [0, 0, kernel - stride, kernel - stride]}
     weights = grown.weight(32, 32, kernel, kernel)
     enlarged = grown.node("ConvTranspose", "image", weights, **window)
-    (work,) = works_of(grown, enlarged, tmp_path / "n.onnx", 64)
+    (work,) = works_of(grown, enlarged, 64)
     pads = [0, 0, taps - 1, taps - 1]
     phase = plain.conv("image", (32, 32, taps, taps), pads=pads)
-    (other,) = works_of(plain, phase, tmp_path / "p.onnx", 64)
+    (other,) = works_of(plain, phase, 64)
     assert work.array_operations == stride**2 * other.array_operations
     assert (work.array_operations == work.operations) is (kernel % stride == 0)
 
@@ -217,25 +213,23 @@ def test_a_share_is_how_much_the_rate_follows_the_part(contention_exponent: floa
     assert alone == pytest.approx([*(parts[:4] / parts[:4].sum()), 0, 0])
 
 
-def test_a_network_without_convolutions_has_no_prediction(tmp_path: Path) -> None:
+def test_a_network_without_convolutions_has_no_prediction() -> None:
     sketch = Sketch(8)
-    path = sketch.save(tmp_path / "p.onnx", sketch.node("MaxPool", "image", kernel_shape=[2, 2]))
+    model = sketch.model(sketch.node("MaxPool", "image", kernel_shape=[2, 2]))
     with pytest.raises(ModelError, match="no convolution"):
-        predict_network(path, DPU)
+        predict_network(model, DPU)
 
 
 @pytest.mark.parametrize(
     ("channels", "read"), [((255,), 3), ((255, 255), 6), ((80,), 80), ((3,), 3), ((324, 16), 340)]
 )
 def test_of_the_maps_of_yolo_a_sort_reads_one_score_for_each_box(
-    tmp_path: Path, channels: tuple[int, ...], read: int
+    channels: tuple[int, ...], read: int
 ) -> None:
     """YOLO has three boxes a pixel. Of other maps, such as the classes of SSD, a sort reads all."""
     sketch = Sketch(8)
     maps = [sketch.conv("image", (count, 8, 3, 3)) for count in channels]
-    path = sketch.save(tmp_path / "h.onnx", *maps)
-    placement = place(read_network(path, 32), DPU)
-    assert placed_work(placement, "sort")[5] == pytest.approx(read * 32 * 32)
+    assert placed_work(placed(sketch.model(*maps), 32), "sort")[5] == pytest.approx(read * 32 * 32)
 
 
 def test_latency_is_that_of_one_core_and_one_thread(tmp_path: Path) -> None:

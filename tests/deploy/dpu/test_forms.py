@@ -1,29 +1,24 @@
-from pathlib import Path
-
 import pytest
 
-from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.operators import forms, fully_connected
-from beers_deploy.dpu.checker.placement import PlacedNode, place
-from beers_deploy.dpu.reading import read_network
+from beers_deploy.dpu.checker.placement import PlacedNode
+from tests.deploy.dpu.draws import DPU, placed
 from tests.deploy.dpu.graphs import Sketch
 
-DPU = load_dpu("vck190")
 
-
-def placed(path: Path, weight: tuple[int, ...], tile_px: int, *pads: int) -> PlacedNode:
+def placed_conv(weight: tuple[int, ...], tile_px: int, *pads: int) -> PlacedNode:
     """Place a convolution over a map of `tile_px` pixels a side."""
     sketch = Sketch(weight[1])
-    sketch.save(path, sketch.conv("image", weight, pads=[*pads] or [0] * 4))
-    return place(read_network(path, tile_px), DPU).nodes[-1]
+    model = sketch.model(sketch.conv("image", weight, pads=[*pads] or [0] * 4))
+    return placed(model, tile_px).nodes[-1]
 
 
-def test_a_layer_as_large_as_its_map_is_also_one_pixel_of_all_its_values(tmp_path: Path) -> None:
-    op = placed(tmp_path / "n.onnx", (10, 8, 20, 20), 20).op
+def test_a_layer_as_large_as_its_map_is_also_one_pixel_of_all_its_values() -> None:
+    op = placed_conv((10, 8, 20, 20), 20).op
     assert fully_connected(op)
     shapes = [(form.kernel, form.channels) for form in forms(op, DPU)]
     assert shapes[1:] == [((20, 20), (8, 10)), ((1, 1), (3200, 10))]
-    padded = placed(tmp_path / "p.onnx", (10, 8, 20, 20), 20, 0, 0, 1, 1)
+    padded = placed_conv((10, 8, 20, 20), 20, 0, 0, 1, 1)
     assert not fully_connected(padded.op)
     assert padded.broken
 
@@ -45,8 +40,8 @@ def test_a_layer_as_large_as_its_map_is_also_one_pixel_of_all_its_values(tmp_pat
     ],
 )
 def test_a_fully_connected_layer_is_accepted_in_any_form_that_fits(
-    tmp_path: Path, weight: tuple[int, ...], tile_px: int, rules: set[str]
+    weight: tuple[int, ...], tile_px: int, rules: set[str]
 ) -> None:
-    node = placed(tmp_path / "n.onnx", weight, tile_px)
+    node = placed_conv(weight, tile_px)
     assert {violation.rule for violation in node.broken} == rules
     assert node.device == ("CPU" if rules else "DPU")

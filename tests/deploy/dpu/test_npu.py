@@ -25,10 +25,6 @@ from tests.quant.quick import fix_sizes
 Draw = Callable[[QdqSketch, str], str]
 
 
-def conv() -> Draw:
-    return lambda s, x: s.qdq_conv(x)
-
-
 def activated(op_type: str, zero: int = 0, kind: type = np.int8) -> Draw:
     """Draw an activation whose result has a zero point, and a convolution that reads it."""
 
@@ -51,15 +47,14 @@ def biased(size: int) -> Draw:
     return draw
 
 
-def write_network(path: Path, draw: Draw, opset: int = 17, side: int | None = 31) -> Path:
-    """Write a file with `draw` behind a convolution, for images of `side` or of any size."""
-    model = onnx.load(behind_qdq_conv(path, draw))
+def network(draw: Draw, opset: int = 17, side: int | None = 31) -> onnx.ModelProto:
+    """Build `draw` behind a convolution, for images of `side` or of any size."""
+    model = behind_qdq_conv(draw)
     model.opset_import[0].version = opset
     if side:
         for value in (*model.graph.input, *model.graph.output):
             fix_sizes(value, 1, 4, side, side)
-    onnx.save(model, path)
-    return path
+    return model
 
 
 def faults(checked: Checked) -> set[str]:
@@ -77,22 +72,18 @@ REFUSED: dict[str, tuple[Draw, Draw]] = {
 
 
 @pytest.mark.parametrize("rule", REFUSED)
-def test_each_case_is_refused_for_its_rule_and_passes_without_it(rule: str, tmp_path: Path) -> None:
-    faulty, remedied = (
-        bd.check(write_network(tmp_path / "n.onnx", draw), target="vek385")
-        for draw in REFUSED[rule]
-    )
+def test_each_case_is_refused_for_its_rule_and_passes_without_it(rule: str) -> None:
+    faulty, remedied = (bd.check(network(draw), target="vek385") for draw in REFUSED[rule])
     assert (faults(faulty), bool(faulty)) == ({rule}, False)
     assert (faults(remedied), bool(remedied)) == (set(), True)
 
 
 def test_an_open_size_and_a_new_opset_are_refused(tmp_path: Path) -> None:
-    left_open = write_network(tmp_path / "n.onnx", conv(), side=None)
+    left_open = network(QdqSketch.qdq_conv, side=None)
     assert faults(bd.check(left_open, target="vek385")) == {"sizes left open"}
-    assert bd.check(write_network(tmp_path / "n.onnx", conv(), opset=20), target="vek385")
-    output = done(
-        "check", write_network(tmp_path / "n.onnx", conv(), opset=21), "--target", "vek385", code=1
-    )
+    assert bd.check(network(QdqSketch.qdq_conv, opset=20), target="vek385")
+    onnx.save(network(QdqSketch.qdq_conv, opset=21), tmp_path / "n.onnx")
+    output = done(f"check {tmp_path}/n.onnx --target vek385", code=1)
     assert " ".join(output.split()).rpartition("check FAILED: ")[2].startswith("opset 21 (Xilinx")
 
 
@@ -107,8 +98,8 @@ def mixed(s: QdqSketch, x: str) -> str:
 
 
 def test_what_is_legal_but_worth_knowing_is_a_note(tmp_path: Path) -> None:
-    path = write_network(tmp_path / "n.onnx", mixed)
-    output = done(f"check {path} --target vek385 --json {tmp_path}/o.json")
+    onnx.save(network(mixed), tmp_path / "n.onnx")
+    output = done(f"check {tmp_path}/n.onnx --target vek385 --json {tmp_path}/o.json")
     rows = valid(tmp_path / "o.json")["rows"]
     devices = {row["text"]["device"] for row in rows if row["table"] == "nodes"}
     by_default = "float, BF16 by the compiler's default"
@@ -119,13 +110,13 @@ def test_what_is_legal_but_worth_knowing_is_a_note(tmp_path: Path) -> None:
     assert " runs" not in output
 
 
-def test_no_limit_of_a_dpu_is_applied(tmp_path: Path) -> None:
+def test_no_limit_of_a_dpu_is_applied() -> None:
     """Every DPU refuses so many channels, and its array decides on a kernel as large as the map."""
     s = QdqSketch(4)
     narrow = s.conv(s.conv("image", (9000, 4, 1, 1)), (4, 9000, 1, 1))
-    path = s.save(tmp_path / "n.onnx", s.conv(narrow, (4, 4, 31, 31), pads=[0] * 4))
-    assert bd.check(path, target="vek385", tile=31)
-    assert not any(bd.check(path, target=board, tile=31) for board in board_names())
+    model = s.model(s.conv(narrow, (4, 4, 31, 31), pads=[0] * 4))
+    assert bd.check(model, target="vek385", tile=31)
+    assert not any(bd.check(model, target=board, tile=31) for board in board_names())
 
 
 def test_nothing_is_predicted_and_what_is_published_is_quoted(tmp_path: Path) -> None:

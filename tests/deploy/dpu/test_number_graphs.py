@@ -4,18 +4,14 @@ the remedy followed.
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.number_rules import AGAIN, MOVE
-from beers_deploy.dpu.checker.placement import place
-from beers_deploy.dpu.reading import read_network
+from tests.deploy.dpu.draws import placed
 from tests.deploy.dpu.graphs import QdqSketch, behind_qdq_conv
 
-DPU = load_dpu("vck190")
 Draw = Callable[[QdqSketch, str], str]
 
 
@@ -86,45 +82,40 @@ CASES: dict[str, tuple[Draw, Draw]] = {
 }
 
 
-def remedies(path: Path, draw: Draw) -> dict[str, str]:
+def remedies(draw: Draw) -> dict[str, str]:
     """Return the rules that `draw` behind a convolution breaks, with their remedies."""
-    nodes = place(read_network(behind_qdq_conv(path, draw), 32), DPU).nodes
     by_rule: dict[str, str] = {}
-    for node in nodes:
+    for node in placed(behind_qdq_conv(draw), 32).nodes:
         by_rule |= {violation.rule: violation.finding.remedy for violation in node.broken}
     return by_rule
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_each_rule_refuses_its_file_alone_and_following_the_remedy_passes(
-    tmp_path: Path, case: str
-) -> None:
+def test_each_rule_refuses_its_file_alone_and_following_the_remedy_passes(case: str) -> None:
     breaking, remedied = CASES[case]
     rule = case.split(":")[0]
-    by_rule = remedies(tmp_path / "n.onnx", breaking)
+    by_rule = remedies(breaking)
     assert list(by_rule) == [rule]
     assert (MOVE if rule.startswith("shift") else AGAIN) in by_rule[rule]
-    assert remedies(tmp_path / "n.onnx", remedied) == {}
+    assert remedies(remedied) == {}
 
 
-def test_two_nodes_may_read_the_same_constant_at_two_scales(tmp_path: Path) -> None:
-    """An optimiser that stores equal bytes once writes such files. The board has two copies."""
-
-    def draw(s: QdqSketch, x: str) -> str:
-        weight = s.constant(np.ones((4, 4, 3, 3), np.int8))
-        bias = s.stored(np.zeros(4, np.int8))
-        for frac_bits in (7, 5):
-            dequantized = s.node("DequantizeLinear", weight, *s.scale(frac_bits))
-            x = s.pair(s.node("Conv", x, dequantized, bias, pads=[1] * 4))
-        return x
-
-    assert remedies(tmp_path / "n.onnx", draw) == {}
+def computed_weights(s: QdqSketch, x: str) -> str:
+    weight = s.pair(s.weight(4, 4, 3, 3))
+    return s.pair(s.node("Conv", x, weight, kernel_shape=[3, 3], pads=[1] * 4))
 
 
-def test_weights_that_other_nodes_compute_are_refused(tmp_path: Path) -> None:
-    def draw(s: QdqSketch, x: str) -> str:
-        return s.pair(
-            s.node("Conv", x, s.pair(s.weight(4, 4, 3, 3)), kernel_shape=[3, 3], pads=[1] * 4)
-        )
+def shared_weights(s: QdqSketch, x: str) -> str:
+    """Draw two convolutions that read the same constant at two scales."""
+    weight = s.constant(np.ones((4, 4, 3, 3), np.int8))
+    bias = s.stored(np.zeros(4, np.int8))
+    for frac_bits in (7, 5):
+        dequantized = s.node("DequantizeLinear", weight, *s.scale(frac_bits))
+        x = s.pair(s.node("Conv", x, dequantized, bias, pads=[1] * 4))
+    return x
 
-    assert AGAIN in remedies(tmp_path / "n.onnx", draw)["int8 constants"]
+
+def test_weights_may_be_read_at_two_scales_but_not_computed_by_other_nodes() -> None:
+    """An optimiser that stores equal bytes once shares constants. The board has two copies."""
+    assert AGAIN in remedies(computed_weights)["int8 constants"]
+    assert remedies(shared_weights) == {}

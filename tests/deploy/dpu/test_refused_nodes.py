@@ -1,48 +1,42 @@
 """Tests of the operators that the DPU refuses at a network's ends, and of their cost."""
 
-from pathlib import Path
-
 import numpy as np
+import onnx
 import pytest
 
 from beers_deploy.dpu.board import load_dpu
-from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.host import FloatWork, float_interval_s, refused_interval_s
 from beers_deploy.dpu.cost.latency import Prediction, predict
 from beers_deploy.dpu.cost.model import between
-from beers_deploy.dpu.reading import network_of, read_network
 from beers_deploy.network import Network
 from beers_deploy.performance.swath import float_work, predict_network
 from beers_deploy.performance.tables import host_words
 from beers_deploy.profiles.errors import ModelError
+from tests.deploy.dpu.draws import DPU, placed
 from tests.deploy.dpu.graphs import IntegerSketch, Sketch
 from tests.quant.quick import patches_of, quickly
 from tests.quant.test_host_end import float_network
 
-DPU = load_dpu("vck190")
 
-
-def segmenter(path: Path, where: str, scale: float = 8.0, behind: str = "") -> Path:
-    """Write a network that enlarges scores of 19 classes from an eighth of the size."""
+def segmenter(where: str, behind: str = "") -> onnx.ModelProto:
+    """Build a network that enlarges scores of 19 classes from an eighth of the size."""
     sketch = Sketch(3)
     deep = sketch.conv("image", (32, 3, 3, 3), strides=[8, 8])
     scores = sketch.conv(deep, (19, 32, 1, 1))
-    sizes = sketch.constant(np.array([1, 1, scale, scale], np.float32))
+    sizes = sketch.constant(np.array([1, 1, 8, 8], np.float32))
     last = sketch.node(
         "Resize", scores, "", sizes, mode="linear", coordinate_transformation_mode=where
     )
-    return sketch.save(path, sketch.node(behind, last) if behind else last)
+    return sketch.model(sketch.node(behind, last) if behind else last)
 
 
-def predicted(path: Path) -> Prediction:
-    return predict_network(path, DPU, 128)
+def predicted(where: str) -> Prediction:
+    return predict_network(segmenter(where), DPU, 128)
 
 
-def test_an_enlargement_on_the_dpu_costs_the_processor_nothing(tmp_path: Path) -> None:
+def test_an_enlargement_on_the_dpu_costs_the_processor_nothing() -> None:
     """UG1414: the DPU enlarges eight times in mode asymmetric, but not in mode half_pixel."""
-    on_dpu, on_cpu = (
-        predicted(segmenter(tmp_path / f"{w}.onnx", w)) for w in ("asymmetric", "half_pixel")
-    )
+    on_dpu, on_cpu = (predicted(where) for where in ("asymmetric", "half_pixel"))
     assert (on_dpu.refused, on_dpu.refused_s) == ((), (0.0, 0.0))
     assert len(on_cpu.refused) == 1
     assert 0 < on_cpu.refused_s[0] < on_cpu.refused_s[1]
@@ -50,46 +44,41 @@ def test_an_enlargement_on_the_dpu_costs_the_processor_nothing(tmp_path: Path) -
     assert on_cpu.host_interval_s[1] > on_cpu.refused_s[1]
 
 
-def test_nodes_behind_a_refused_node_stay_on_the_processor(tmp_path: Path) -> None:
-    path = segmenter(tmp_path / "n.onnx", "half_pixel", behind="GlobalMaxPool")
-    placement = place(read_network(path, 128), DPU)
+def test_nodes_behind_a_refused_node_stay_on_the_processor() -> None:
+    placement = placed(segmenter("half_pixel", behind="GlobalMaxPool"), 128)
     assert [node.device for node in placement.nodes] == ["DPU", "DPU", "CPU", "host"]
     assert [cut.onto_dpu for cut in placement.cuts] == [True, False]
 
 
-def test_a_refused_node_in_front_also_runs_on_the_processor(tmp_path: Path) -> None:
+def test_a_refused_node_in_front_also_runs_on_the_processor() -> None:
     sketch = Sketch(8)
-    path = sketch.save(tmp_path / "n.onnx", sketch.conv(sketch.node("Softmax", "image", axis=1)))
-    assert predict_network(path, DPU, 20).refused == (sketch.nodes[0].name,)
+    model = sketch.model(sketch.conv(sketch.node("Softmax", "image", axis=1)))
+    assert predict_network(model, DPU, 20).refused == (sketch.nodes[0].name,)
 
 
-def test_between_two_convolutions_of_the_dpu_there_is_no_prediction(tmp_path: Path) -> None:
+def test_between_two_convolutions_of_the_dpu_there_is_no_prediction() -> None:
     sketch = Sketch(8)
     skip = sketch.conv("image")
     summed = sketch.node("Add", skip, sketch.node("Softmax", skip, axis=1))
-    path = sketch.save(tmp_path / "n.onnx", sketch.conv(summed))
     with pytest.raises(ModelError, match="softmax"):
-        predict_network(path, DPU, 20)
+        predict_network(sketch.model(sketch.conv(summed)), DPU, 20)
 
 
-def test_numbers_that_the_dpu_refuses_are_no_work_for_the_processor(tmp_path: Path) -> None:
+def test_numbers_that_the_dpu_refuses_are_no_work_for_the_processor() -> None:
     sketch = IntegerSketch()
     first = sketch.qconv(sketch.quantized("image"), (4, 1, 3, 3))
     last = sketch.qconv(first, (4, 4, 3, 3), weight_scale=0.3)
-    path = sketch.save(tmp_path / "n.onnx", sketch.node("DequantizeLinear", last, *sketch.numbers))
+    model = sketch.model(sketch.node("DequantizeLinear", last, *sketch.numbers))
     with pytest.raises(ModelError, match="check"):
-        predict_network(path, DPU, 20)
+        predict_network(model, DPU, 20)
 
 
 @pytest.mark.parametrize("board", ["vck190", "zcu102", "kv260"])
 def test_time_is_in_proportion_to_the_work_and_lies_between_peak_and_plain_code(
-    tmp_path: Path, board: str
+    board: str,
 ) -> None:
     dpu = load_dpu(board)
-    ops = [
-        read_network(segmenter(tmp_path / f"{px}.onnx", "half_pixel"), px).operations[-1]
-        for px in (128, 256)
-    ]
+    ops = [placed(segmenter("half_pixel"), px).nodes[-1].op for px in (128, 256)]
     (low, high), larger = (refused_interval_s([op], dpu) for op in ops)
     assert larger == pytest.approx((4 * low, 4 * high))
     assert refused_interval_s(ops[:1] * 3, dpu) == pytest.approx((3 * low, 3 * high))
@@ -102,16 +91,16 @@ def test_time_is_in_proportion_to_the_work_and_lies_between_peak_and_plain_code(
     assert refused_interval_s([], dpu) == (0.0, 0.0)
 
 
-def test_the_notes_name_the_nodes_that_the_processor_runs(tmp_path: Path) -> None:
-    prediction = predicted(segmenter(tmp_path / "n.onnx", "half_pixel"))
+def test_the_notes_name_the_nodes_that_the_processor_runs() -> None:
+    prediction = predicted("half_pixel")
     _, sentence = host_words(prediction)
     assert "vck190" in sentence
     assert prediction.refused[0] in sentence
-    assert len(host_words(predicted(segmenter(tmp_path / "d.onnx", "asymmetric")))) == 1
+    assert len(host_words(predicted("asymmetric"))) == 1
 
 
-def heads(path: Path) -> Path:
-    """Write a network of two maps of 255 channels, at a half and a quarter of the size.
+def heads() -> onnx.ModelProto:
+    """Build a network of two maps of 255 channels, at a half and a quarter of the size.
 
     It first moves the image's pixels to channels.
     """
@@ -120,28 +109,24 @@ def heads(path: Path) -> Path:
     half = sketch.conv(apart, (16, 12, 3, 3))
     quarter = sketch.conv(half, (32, 16, 3, 3), strides=[2, 2])
     results = [sketch.conv(half, (255, 16, 1, 1)), sketch.conv(quarter, (255, 32, 1, 1))]
-    return sketch.save(path, *(sketch.node("Sigmoid", result) for result in results))
+    return sketch.model(*(sketch.node("Sigmoid", result) for result in results))
 
 
-def test_several_heads_are_copied_and_are_no_image(tmp_path: Path) -> None:
-    path = heads(tmp_path / "h.onnx")
-    placement = place(read_network(path, 64), DPU)
+def test_several_heads_are_copied_and_are_no_image() -> None:
+    placement = placed(heads(), 64)
     assert placement.failed == ()
     assert sum(cut.size_bytes or 0 for cut in placement.cuts if not cut.onto_dpu) == 255 * (
         32**2 + 16**2
     )
-    prediction = predict_network(path, DPU, 64)
+    prediction = predict_network(heads(), DPU, 64)
     assert (prediction.task, prediction.refused) == ("copy", ())
 
 
-def test_results_of_few_bands_become_an_image_and_scores_do_not(tmp_path: Path) -> None:
-    for channels, block, task in ((12, 2, "image"), (76, 2, "copy")):
+def test_results_of_few_bands_become_an_image_and_scores_do_not() -> None:
+    for channels, task in ((12, "image"), (76, "copy")):
         sketch = Sketch(3)
-        last = sketch.node(
-            "DepthToSpace", sketch.conv("image", (channels, 3, 3, 3)), blocksize=block
-        )
-        path = sketch.save(tmp_path / f"{channels}.onnx", last)
-        assert predict_network(path, DPU, 64).task == task
+        last = sketch.node("DepthToSpace", sketch.conv("image", (channels, 3, 3, 3)), blocksize=2)
+        assert predict_network(sketch.model(last), DPU, 64).task == task
 
 
 def test_what_the_host_computes_in_float_takes_time_in_both_files() -> None:
@@ -151,12 +136,12 @@ def test_what_the_host_computes_in_float_takes_time_in_both_files() -> None:
     int8 = quickly(network, patches_of([raw])).host
     work = float_work(Network.load(int8))
     assert work == FloatWork(("nearest", "Tanh"), copies=2)
-    placed = place(network_of(int8, 64), DPU)
-    low, high = float_interval_s(placed, "image", work, DPU)
+    placement = placed(int8, 64)
+    low, high = float_interval_s(placement, "image", work, DPU)
     assert 0 < low < high
-    assert float_interval_s(placed, "image", FloatWork(), DPU) == (0, 0)
-    of_float = float_interval_s(place(network_of(network, 64), DPU), "image", FloatWork(), DPU)
+    assert float_interval_s(placement, "image", FloatWork(), DPU) == (0, 0)
+    of_float = float_interval_s(placed(network, 64), "image", FloatWork(), DPU)
     assert of_float == pytest.approx((low, high))
-    with_it, without = (predict(placed, DPU, float_work=each) for each in (work, FloatWork()))
+    with_it, without = (predict(placement, DPU, float_work=each) for each in (work, FloatWork()))
     assert with_it.latency_s > without.latency_s
     assert with_it.host_interval_s[1] - without.host_interval_s[1] > high

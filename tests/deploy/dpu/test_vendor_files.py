@@ -8,14 +8,10 @@ import numpy as np
 import pytest
 from onnxruntime.quantization import QuantFormat, QuantType
 
-from beers_deploy.dpu.board import load_dpu
-from beers_deploy.dpu.checker.placement import Placement, place
-from beers_deploy.dpu.reading import read_network
-from tests.deploy.dpu.draws import rules_of
+from tests.deploy.dpu.draws import placed_file, rules_of
 from tests.deploy.dpu.graphs import Sketch
 from tests.quant.quick import quantized_freely
 
-DPU = load_dpu("vck190")
 TILE_PX = 34
 
 
@@ -59,10 +55,6 @@ def quantized(
     )
 
 
-def rules(placement: Placement) -> set[str]:
-    return set(rules_of(placement.nodes))
-
-
 @pytest.mark.parametrize(
     ("form", "kind", "per_channel"),
     [
@@ -76,9 +68,8 @@ def test_onnxruntimes_files_are_refused_only_for_their_scales_and_types(
     tmp_path: Path, form: QuantFormat, kind: QuantType, per_channel: bool
 ) -> None:
     signed = kind == QuantType.QInt8
-    placement = place(
-        read_network(quantized(tmp_path / "q.onnx", form, kind, per_channel, signed), TILE_PX), DPU
-    )
+    path = quantized(tmp_path / "q.onnx", form, kind, per_channel, signed)
+    nodes = placed_file(path, TILE_PX).nodes
     expected = (
         {"power of two"}
         | ({"per tensor"} if per_channel else set())
@@ -87,7 +78,7 @@ def test_onnxruntimes_files_are_refused_only_for_their_scales_and_types(
     # Its QDQ files hold int32 biases, its QOperator files the transposed convolution's weights in
     # float.
     expected |= {"int8 bias"} if form == QuantFormat.QDQ else {"int8 constants"}
-    assert rules(placement) == expected
-    core = [node.op for node in placement.nodes if node.part == "dpu-core"]
+    assert set(rules_of(nodes)) == expected
+    core = [node.op for node in nodes if node.part == "dpu-core"]
     assert {op.kind for op in core} >= {"conv", "add", "pool", "transposed", "activation"}
     assert all(op.out_shape is not None and op.integer for op in core)
