@@ -13,6 +13,9 @@ from onnxruntime.quantization import CalibrationDataReader, quantize_static
 
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.quant.bounds import layer_bounds
+from beers_deploy.quant.core import IntCore
+from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
@@ -20,10 +23,12 @@ from beers_deploy.quant.graph import (
     Conv,
     Graph,
     Op,
+    Resize,
     graph_to_onnx,
     same,
 )
 from beers_deploy.quant.host_part import ONE_CHANNEL, HostPart
+from beers_deploy.quant.integer.reference import INT32_BITS, run_core
 from beers_deploy.quant.onnx.image_input import image_info
 from beers_deploy.quant.onnx_file import GraphWriter, make_model
 from beers_deploy.quant.quantize import Quantized, quantize_model
@@ -101,6 +106,18 @@ def assert_same(
     """Check that two models compute the same from an image, exactly if no tolerance is given."""
     expected = run_model(model, image)
     np.testing.assert_allclose(run_model(other, image), expected, rtol=rtol, atol=atol)
+
+
+def assert_within_bounds(core: IntCore, planes: np.ndarray) -> None:
+    """Check that no result and no accumulator leaves the bounds that are proven for any image."""
+    tensors, reports = run_core(core, planes)
+    for op, bound, report in zip(core.ops, layer_bounds(core), reports, strict=True):
+        assert max(bound.low, INT8_MIN) <= tensors[op.output].min(), op.name
+        assert tensors[op.output].max() <= min(bound.high, INT8_MAX), op.name
+        assert report.peak_bits <= report.proven_bits, op.name
+        # The bits of an enlargement are those of its result, not of its weighted sums.
+        assert report.peak_bits <= bound.bits < INT32_BITS or isinstance(op, Resize), op.name
+        assert bound.saturates or report.saturated == 0, op.name
 
 
 def behind_conv(write: Callable[[GraphWriter], object]) -> onnx.ModelProto:
