@@ -29,12 +29,11 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.host_part import ONE_CHANNEL, HostPart
 from beers_deploy.quant.integer.reference import INT32_BITS, run_core
-from beers_deploy.quant.onnx.image_input import image_info
-from beers_deploy.quant.onnx_file import GraphWriter, make_model
 from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.samples.simulated import draw_patches
 from beers_deploy.quant.session import open_session, planes_of, result_of
+from tests.quant.simplify.networks import parsed
 
 
 def image(height: int = 37, width: int = 53, seed: int = 0, channels: int = 1) -> np.ndarray:
@@ -83,6 +82,19 @@ def with_relu6(size: float) -> Graph:
     return tuple(graph)
 
 
+def random_conv(
+    generator: np.random.Generator,
+    source: str,
+    output: str,
+    shape: tuple[int, ...],
+    activation: Activation = Activation.none,
+) -> Conv:
+    """Return a convolution of random weights and biases that preserves the size."""
+    weight = generator.normal(0, 0.5, shape).astype(np.float32)
+    bias = generator.normal(0, 0.5, shape[0]).astype(np.float32)
+    return Conv(f"{output}.conv", source, output, weight, bias, activation, same(weight))
+
+
 def in_float(
     graph: Graph, image: np.ndarray, host_part: HostPart = ONE_CHANNEL, name: str = CORRECTION
 ) -> np.ndarray:
@@ -120,15 +132,13 @@ def assert_within_bounds(core: IntCore, planes: np.ndarray) -> None:
         assert bound.saturates or report.saturated == 0, op.name
 
 
-def behind_conv(write: Callable[[GraphWriter], object]) -> onnx.ModelProto:
-    """Build a 1 x 1 convolution, followed by what `write` writes from `x` to `restored`."""
-    writer = GraphWriter()
-    writer.node(
-        "Conv", "x", ["image", writer.constant("w", np.ones((2, 1, 1, 1), np.float32))], "first"
+def behind_conv(nodes: str, **constants: Any) -> onnx.ModelProto:
+    """Return a 1 x 1 convolution from `image` to `x`, and nodes from `x` to `restored`."""
+    return parsed(
+        f"x = Conv(image, first) {nodes}",
+        "float[N,1,H,W] image => float[N,C,P,Q] restored",
+        constants={"first": np.ones((2, 1, 1, 1)), **constants},
     )
-    write(writer)
-    result = onnx.helper.make_tensor_value_info("restored", onnx.TensorProto.FLOAT, None)
-    return make_model(writer.graph("g", [image_info("image", 1, None)], [result]), {})
 
 
 def fix_sizes(value: onnx.ValueInfoProto, *sizes: int) -> None:

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from beers_deploy.model.progress import Step, progress, reporting
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.quant.core import IntConv, IntCore, build_core, shift_faults
+from beers_deploy.quant.core import IntCore, build_core, shift_faults
 from beers_deploy.quant.graph import (
     PLANES,
     Shuffle,
@@ -28,6 +28,7 @@ from beers_deploy.quant.passes.finetune import BORDER_PX, Sample, Tuning, finetu
 from beers_deploy.quant.passes.scales import moved as moved_tensors
 from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.samples.patches import Patches
+from beers_deploy.studies.stress.faults import with_ops
 from tests.quant.quick import quickly, without_references
 from tests.quant.trained import assert_equals_reference, moved, odd_operations
 
@@ -35,13 +36,11 @@ from tests.quant.trained import assert_equals_reference, moved, odd_operations
 def corrupted(core: IntCore) -> IntCore:
     """Return a core whose weights are off by a few units."""
     generator = np.random.default_rng(5)
-
-    ops = list(core.ops)
-    for place, op in enumerate(ops):
-        if isinstance(op, IntConv):
-            weight = op.weight + generator.integers(-4, 5, op.weight.shape)
-            ops[place] = replace(op, weight=np.clip(weight, -128, 127).astype(np.int8))
-    return replace(core, ops=tuple(ops))
+    ops = []
+    for op in core.convolutions:
+        weight = op.weight + generator.integers(-4, 5, op.weight.shape)
+        ops.append(replace(op, weight=np.clip(weight, -128, 127).astype(np.int8)))
+    return with_ops(core, ops)
 
 
 def correction(core: IntCore, degraded: np.ndarray) -> np.ndarray:

@@ -1,5 +1,3 @@
-from typing import Any
-
 import numpy as np
 import onnx
 import pytest
@@ -20,7 +18,6 @@ from beers_deploy.quant.graph import (
     read_network,
 )
 from beers_deploy.quant.host_part import IMAGE_SLICES
-from beers_deploy.quant.onnx_file import GraphWriter
 from tests.quant.quick import behind_conv, copied, run_model
 from tests.quant.simplify.networks import parsed
 
@@ -83,14 +80,8 @@ def test_one_number_a_channel_behind_an_activation_is_a_convolution(
 ) -> None:
     value = np.random.default_rng(0).normal(size=shape).astype(np.float32)
 
-    def write(w: GraphWriter) -> None:
-        w.node(
-            kind,
-            "restored",
-            [w.node("LeakyRelu", "y", ["x"], alpha=26 / 256), w.constant("own", value)],
-        )
-
-    last = read_network(behind_conv(write)).graph[-1]
+    nodes = f"y = LeakyRelu<alpha=0.1015625>(x) restored = {kind}(y, own)"
+    last = read_network(behind_conv(nodes, own=value)).graph[-1]
     assert isinstance(last, Conv)
     per_channel = np.broadcast_to(value.ravel(), 2)
     factor, offset = {"Add": (1, per_channel), "Sub": (1, -per_channel), "Mul": (per_channel, 0)}[
@@ -108,17 +99,9 @@ def test_one_number_a_channel_behind_an_activation_is_a_convolution(
 def test_a_nearest_resize_is_accepted_where_it_makes_blocks(
     where: str, rounding: str, factor: int
 ) -> None:
-    def write(w: GraphWriter) -> None:
-        how = {"mode": "nearest", "coordinate_transformation_mode": where, "nearest_mode": rounding}
-        w.node(
-            "Resize",
-            "restored",
-            ["x", "", w.constant("s", np.array([1, 1, factor, factor], np.float32))],
-            "r",
-            **how,
-        )
-
-    model = behind_conv(write)
+    how = f'coordinate_transformation_mode="{where}", nearest_mode="{rounding}"'
+    sizes = [1.0, 1.0, factor, factor]
+    model = behind_conv(f'restored = Resize<mode="nearest", {how}>(x, , sizes)', sizes=sizes)
     pixels = np.random.default_rng(0).random((1, 1, 5, 7), np.float32)
     result = run_model(model, pixels)[:, :1]
     # With aligned corners the positions depend on the image's size, so a match proves nothing.
@@ -136,27 +119,19 @@ def test_a_nearest_resize_is_accepted_where_it_makes_blocks(
 @pytest.mark.parametrize(
     ("attributes", "message"),
     [
-        ({"strides": [2, 1]}, "one stride.*got strides \\[2, 1\\]"),
-        ({"strides": [2, 2], "dilations": [2, 2]}, "no dilation, got dilations \\[2, 2\\]"),
-        ({"strides": [2, 2], "output_padding": [1, 1]}, "output padding, got \\[1, 1\\]"),
-        ({"strides": [2, 2], "auto_pad": "SAME_UPPER"}, "auto_pad SAME_UPPER"),
-        ({"strides": [2, 2], "output_shape": [9, 9]}, "output_shape \\[9, 9\\]"),
+        ("strides=[2,1]", "one stride.*got strides \\[2, 1\\]"),
+        ("strides=[2,2], dilations=[2,2]", "no dilation, got dilations \\[2, 2\\]"),
+        ("strides=[2,2], output_padding=[1,1]", "output padding, got \\[1, 1\\]"),
+        ('strides=[2,2], auto_pad="SAME_UPPER"', "auto_pad SAME_UPPER"),
+        ("strides=[2,2], output_shape=[9,9]", "output_shape \\[9, 9\\]"),
     ],
 )
 def test_transposed_convolutions_that_the_dpu_lacks_are_refused(
-    attributes: dict[str, Any], message: str
+    attributes: str, message: str
 ) -> None:
-    def write(w: GraphWriter) -> None:
-        w.node(
-            "ConvTranspose",
-            "restored",
-            ["x", w.constant("t", np.ones((2, 2, 2, 2), np.float32))],
-            "up",
-            **attributes,
-        )
-
+    nodes = f"[up] restored = ConvTranspose<{attributes}>(x, t)"
     with pytest.raises(ModelError, match=f"ConvTranspose up must .*{message}"):
-        read_network(behind_conv(write))
+        read_network(behind_conv(nodes, t=np.ones((2, 2, 2, 2))))
 
 
 @pytest.mark.parametrize(
@@ -169,7 +144,7 @@ def test_transposed_convolutions_that_the_dpu_lacks_are_refused(
 def test_two_inputs_or_outputs_are_refused_by_name(
     end: str, name: str, channels: int, message: str
 ) -> None:
-    model = behind_conv(lambda w: w.node("Add", "restored", ["x", name]))
+    model = behind_conv(f"restored = Add(x, {name})")
     info = helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["N", channels, "H", "W"])
     getattr(model.graph, end).append(info)
     with pytest.raises(ModelError, match=message):

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.quant.onnx_file import GraphWriter
 from beers_deploy.quant.samples.coverage import histogram, range_from
 from beers_deploy.quant.samples.simulated import Calibration, draw_patches, unseen_patches
 from beers_deploy.quant.samples.views import (
@@ -102,13 +101,9 @@ def test_scales_hold_ground_that_is_brighter_than_the_samples() -> None:
 
     The samples have a tenth of the light of the image that is judged.
     """
-
-    def write(writer: GraphWriter) -> None:
-        weight = writer.constant("v", np.full((1, 2, 1, 1), 0.5, np.float32))
-        writer.node("HardSwish", "y", ["x"], "activation")
-        writer.node("Conv", "restored", ["y", weight], "last")
-
-    model = behind_conv(write)
+    model = behind_conv(
+        "y = HardSwish(x) restored = Conv(y, last)", last=np.full((1, 2, 1, 1), 0.5)
+    )
     (bright,) = waves(1)
     expected = run(open_session(model), bright)
     patches = without_references(patches_of([np.float32(0.1) * image for image in waves()]))

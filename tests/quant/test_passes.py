@@ -2,6 +2,7 @@
 
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from unittest.mock import patch
 
@@ -49,7 +50,7 @@ from beers_deploy.quant.passes.trial import Costs, CropTrials
 from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session
-from tests.quant.quick import image, in_float, quickly, run_model
+from tests.quant.quick import image, in_float, quickly, random_conv, run_model
 from tests.quant.simplify.networks import parsed
 from tests.quant.test_odd_networks import SAME, sketch
 
@@ -86,30 +87,18 @@ def test_ranges_are_equalized_to_the_group_s_own(graph: Graph, patches: Patches)
     assert dead_ranges[3] >= 1e-4 * dead_ranges.max()
 
 
-def skipping(seed: int = 0) -> Graph:
+def skipping() -> Graph:
     """Build a graph that pools and enlarges a sum behind a ReLU6, and concatenates both."""
-    generator = np.random.default_rng(seed)
-
-    def conv(
-        source: str,
-        output: str,
-        outputs: int,
-        inputs: int,
-        activation: Activation = Activation.none,
-    ) -> Conv:
-        weight = generator.normal(0, 0.5, (outputs, inputs, 1, 1)).astype(np.float32)
-        bias = generator.normal(0, 0.5, outputs).astype(np.float32)
-        return Conv(f"{output}.conv", source, output, weight, bias, activation)
-
+    conv = partial(random_conv, np.random.default_rng(0))
     return (
-        conv(PLANES, "head", 3, 3, Activation.relu6),
-        conv("head", "inner", 3, 3),
+        conv(PLANES, "head", (3, 3, 1, 1), Activation.relu6),
+        conv("head", "inner", (3, 3, 1, 1)),
         Add("add", ("head", "inner"), "sum"),
         MaxPool("max", "sum", "pooled", (2, 2), Window((2, 2))),
-        conv("pooled", "deep", 2, 3),
+        conv("pooled", "deep", (2, 3, 1, 1)),
         Resize("resize", "deep", "up", 2),
         Concat("join", ("up", "sum"), "both"),
-        conv("both", CORRECTION, 1, 5),
+        conv("both", CORRECTION, (1, 5, 1, 1)),
     )
 
 

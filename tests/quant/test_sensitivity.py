@@ -8,7 +8,6 @@ import onnx
 import pytest
 
 from beers_deploy.profiles.instrument import MAX_DN
-from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import Add
@@ -17,6 +16,7 @@ from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.sensitivity import Loss, layer_error_rows, layer_errors, losses
 from beers_deploy.quant.session import few_crops, open_session, result_of, run
+from beers_deploy.studies.stress.faults import with_ops
 from tests.quant.quick import image, patches_of, quickly, without_references
 from tests.quant.simplify.networks import parsed
 
@@ -90,11 +90,8 @@ def test_a_network_of_a_large_fixed_size_is_attributed_on_whole_images() -> None
 @pytest.fixture(scope="module")
 def corrupted(quantized: Quantized) -> Quantized:
     """Return the network with the weights of one layer negated."""
-    ops = list(quantized.core.ops)
-    for place, op in enumerate(ops):
-        if op.name == CORRUPTED and isinstance(op, IntConv):
-            ops[place] = replace(op, weight=-op.weight)
-    core = replace(quantized.core, ops=tuple(ops))
+    op = next(op for op in quantized.core.convolutions if op.name == CORRUPTED)
+    core = with_ops(quantized.core, [replace(op, weight=-op.weight)])
     return replace(quantized, core=core, host=host_model(core, {}))
 
 

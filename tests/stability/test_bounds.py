@@ -15,6 +15,7 @@ from beers_deploy.quant.host_part import IMAGE_SLICES
 from beers_deploy.quant.integer.reference import INT32_BITS
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.quantize import Quantized
+from beers_deploy.studies.stress.faults import with_ops
 from tests.quant.quick import assert_within_bounds
 
 
@@ -30,8 +31,7 @@ def test_an_accumulator_that_overflows_is_found(quantized: Quantized) -> None:
     huge = replace(
         op, bias=np.full(len(op.bias), 2**31, np.int64), bias_frac_bits=op.weight_frac_bits + 7
     )
-    core = replace(quantized.core, ops=(huge, *quantized.core.ops[1:]))
-    assert layer_bounds(core)[0].bits >= INT32_BITS
+    assert layer_bounds(with_ops(quantized.core, [huge]))[0].bits >= INT32_BITS
 
 
 @pytest.mark.parametrize("path", sorted(SHIPPED.glob("*-int8.onnx")), ids=lambda path: path.stem)

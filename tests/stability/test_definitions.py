@@ -13,13 +13,14 @@ from beers_deploy.model.metrics.fidelity import SSIM_RADIUS_PX, SSIM_SIGMA_PX, s
 from beers_deploy.model.simulator.mtf import mtf
 from beers_deploy.model.traditional.compensate import compensation_gain
 from beers_deploy.profiles.response import NYQUIST
-from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import board_model, host_model
 from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS
 from beers_deploy.quant.host_part import IMAGE_SLICES, DualRange
 from beers_deploy.quant.integer.reference import correction
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.session import open_session, run
+from beers_deploy.studies.stress.faults import with_ops
 from tests.model.simulator.stages import with_contrast
 
 
@@ -62,13 +63,12 @@ def test_ssim_is_that_of_its_definition(
 def biased(core: IntCore, generator: np.random.Generator) -> IntCore:
     """Return the core with random int8 biases, at random scales that the DPU can shift."""
     ops = []
-    for op in core.ops:
-        if isinstance(op, IntConv):
-            bias = generator.integers(-128, 128, len(op.bias)).astype(np.int8)
-            product = op.weight_frac_bits + core.frac_bits[op.input]
-            op = replace(op, bias=bias, bias_frac_bits=product - int(generator.integers(0, 8)))
-        ops.append(op)
-    return replace(core, ops=tuple(ops))
+    for op in core.convolutions:
+        bias = generator.integers(-128, 128, len(op.bias)).astype(np.int8)
+        product = op.weight_frac_bits + core.frac_bits[op.input]
+        shift = int(generator.integers(0, 8))
+        ops.append(replace(op, bias=bias, bias_frac_bits=product - shift))
+    return with_ops(core, ops)
 
 
 @pytest.mark.parametrize("shape", [(17, 20), (1, 1), (1, 19), (12, 2)])

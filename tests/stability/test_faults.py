@@ -121,7 +121,7 @@ def test_numbers_that_the_board_could_not_store_are_refused(quantized: Quantized
     )
     for wrong in (too_large, far):
         with pytest.raises(ModelError, match=op.name):
-            as_stored(replace(quantized.core, ops=(wrong, *quantized.core.ops[1:])))
+            as_stored(with_ops(quantized.core, [wrong]))
 
 
 def test_maps_have_the_channels_that_run(quantized: Quantized) -> None:

@@ -29,6 +29,7 @@ from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.graph import PLANES
 from beers_deploy.quant.integer.arithmetic import saturated
 from beers_deploy.quant.integer.reference import layer_sums, rounded
+from beers_deploy.studies.stress.faults import with_ops
 from examples.networks import build, to_onnx
 from tests.deploy.command_line import done, refused
 from tests.quant.quick import one_guess
@@ -71,9 +72,7 @@ def middle(core: IntCore) -> IntConv:
 
 
 def with_middle(core: IntCore, **other: Any) -> IntCore:
-    return replace(
-        core, ops=tuple(replace(op, **other) if op is middle(core) else op for op in core.ops)
-    )
+    return with_ops(core, [replace(middle(core), **other)])
 
 
 def flipped(values: np.ndarray, place: tuple[int, ...], bit: int) -> np.ndarray:

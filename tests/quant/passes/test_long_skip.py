@@ -20,7 +20,6 @@ from beers_deploy.quant.graph import (
     Graph,
     graph_to_onnx,
     read_planes,
-    same,
 )
 from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.passes.long_skip import split_long_skip
@@ -30,24 +29,18 @@ from beers_deploy.quant.session import open_session
 from beers_deploy.quant.simplify.simplify import simplify
 from beers_deploy.quant.structure import saturated_shares
 from examples.networks import to_onnx
-from tests.quant.quick import patches_of, run_model, waves
+from tests.quant.quick import patches_of, random_conv, run_model, waves
 
 FEATURES = 5
-
-
-def conv(generator: np.random.Generator, source: str, output: str, shape: tuple[int, ...]) -> Conv:
-    weight = generator.normal(0, 0.5, shape).astype(np.float32)
-    bias = generator.normal(0, 0.5, shape[0]).astype(np.float32)
-    return Conv(f"{output}.conv", source, output, weight, bias, Activation.none, same(weight))
 
 
 def skipping(seed: int, channels: int = 1, head: int = 3, tail: int = 3) -> Graph:
     """Build a network whose body reads the features of the head and is added to them."""
     generator = np.random.default_rng(seed)
-    first = conv(generator, IMAGE, "head", (FEATURES, channels, head, head))
-    inner = conv(generator, "head", "inner", (FEATURES, FEATURES, 3, 3))
-    last = conv(generator, "sum", CORRECTION, (2, FEATURES, tail, tail))
-    body = replace(inner, activation=Activation.relu)
+    wide = (FEATURES, FEATURES, 3, 3)
+    first = random_conv(generator, IMAGE, "head", (FEATURES, channels, head, head))
+    body = random_conv(generator, "head", "inner", wide, Activation.relu)
+    last = random_conv(generator, "sum", CORRECTION, (2, FEATURES, tail, tail))
     return read_planes((first, body, Add("add", ("inner", "head"), "sum"), last))
 
 
@@ -99,7 +92,7 @@ def graphs_without_long_skip() -> dict[str, Graph]:
     first, body, add, last = skipping(0)
     assert isinstance(add, Add)
     assert isinstance(first, Conv)
-    again = conv(np.random.default_rng(1), "sum", "other", (2, FEATURES, 1, 1))
+    again = random_conv(np.random.default_rng(1), "sum", "other", (2, FEATURES, 1, 1))
     apart = Add("end", ("other", CORRECTION + ".1"), CORRECTION)
     return {
         "activation of the sum": (first, body, replace(add, activation=Activation.relu), last),

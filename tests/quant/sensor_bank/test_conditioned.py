@@ -35,6 +35,7 @@ from beers_deploy.quant.sensor_bank.conditioned import (
 )
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.receptive_field import tiling_of
+from beers_deploy.studies.stress.faults import with_ops
 from tests.model.networks import condition_of
 from tests.quant.quick import assert_within_bounds
 from tests.quant.sensor_bank.test_filters import textured
@@ -278,11 +279,10 @@ def test_a_damaged_delta_and_one_of_another_network_are_refused(
 def test_a_delta_does_not_fit_a_network_of_the_same_layers(conditioned: ConditionedCore) -> None:
     core = core_of(conditioned, SENSORS[1])
     delta = delta_of_file(file_of(conditioned, SENSORS[1]))
-    last = next(op for op in reversed(core.ops) if isinstance(op, IntConv))
-    other = replace(last, weight=last.weight[::-1].copy())
-    ops = tuple(other if op is last else op for op in core.ops)
+    last = core.convolutions[-1]
+    other = with_ops(core, [replace(last, weight=last.weight[::-1].copy())])
     with pytest.raises(ModelError, match=r"belongs to another network .*other weights"):
-        with_delta(replace(core, ops=ops), delta)
+        with_delta(other, delta)
 
 
 def test_biases_of_another_network_are_refused(conditioned: ConditionedCore) -> None:
