@@ -8,7 +8,7 @@ else of it. Each place is acquired by sensors of the trained family: the exponen
 places that the networks were trained on, the quantiles are taken from the places that their recipe
 held out of the training.
 
-`judge` prints tables of coverage by place, level, brightness and sensor, and draws the first
+`judge` prints tables of coverage by sensor, level and brightness, and draws the first
 network's reliability. No named sensor was among those of the calibration.
 """
 
@@ -46,7 +46,7 @@ from beers_deploy.quant.sensor_bank.conditioned import WEIGHTS
 from beers_deploy.restoration.interval import interval_of
 from beers_deploy.studies.evaluation.calibrate import write_with_interval
 from benchmarks.self_check import NOMINAL as LIKE
-from benchmarks.self_check import REFERENCE, restorer
+from benchmarks.self_check import REFERENCE, block_means, restorer
 
 FAMILY = SensorFamily(LIKE.nominal(), other_curves=0.3)
 RECIPES = SHIPPED.parent / "recipes"
@@ -214,16 +214,8 @@ def judgement(name: str, image: Acquired, interval: PixelInterval) -> Judgement:
     ]
     counts = (image.raw < scale)[inner]
     scores = np.stack([error[counts] / width[counts] for width in widths])
-    blocks = np.stack([block_means(widths[LEVELS.index(90)]), block_means(error)])
-    return Judgement(image.site, scores, image.truth[inner][counts] / scale, blocks)
-
-
-def block_means(pixels: np.ndarray) -> np.ndarray:
-    """Return the means over whole blocks of BLOCK_PX, in one row."""
-    rows, columns = (size // BLOCK_PX for size in pixels.shape)
-    whole = pixels[: rows * BLOCK_PX, : columns * BLOCK_PX]
-    blocks = whole.reshape(rows, BLOCK_PX, columns, BLOCK_PX)
-    return np.asarray(blocks.mean((1, 3))).ravel()
+    blocks = [block_means(each, BLOCK_PX).ravel() for each in (widths[LEVELS.index(90)], error)]
+    return Judgement(image.site, scores, image.truth[inner][counts] / scale, np.stack(blocks))
 
 
 def judgements(
@@ -268,10 +260,6 @@ def tables(name: str, folders: Sequence[Path], plot: Path | None) -> Iterator[st
     for level in LEVELS:
         means = [np.mean(list(place_coverage(j, level).values())) for j in by_sensor.values()]
         yield f"| {level} % | " + " | ".join(f"{mean:.1%}" for mean in means) + " |"
-    yield "| place | " + " | ".join(by_sensor) + " |"
-    places = [place_coverage(judged) for judged in by_sensor.values()]
-    for site in places[0]:
-        yield f"| {site} | " + " | ".join(f"{place[site]:.1%}" for place in places) + " |"
     nominal = by_sensor["pleiades-degraded"]
     yield "| brightness | pixels | coverage |"
     brightness = np.concatenate([each.brightness for each in nominal])

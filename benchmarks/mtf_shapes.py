@@ -48,12 +48,9 @@ def main() -> None:
     parser.add_argument("--images", type=Path, required=True)
     parser.add_argument("--methods", default="traditional,convbeers-s-int8,convbeers-s-curves-int8")
     parser.add_argument("--contrast", type=float, default=0.07)
-    parser.add_argument("--curves", help="names, separated by commas; all if none")
     arguments = parser.parse_args()
     sensor = Sensor.load("pleiades-degraded")
-    drawn = curves(arguments.contrast)
-    for name in arguments.curves.split(",") if arguments.curves else drawn:
-        contrasts = drawn[name]
+    for name, contrasts in curves(arguments.contrast).items():
         values = tuple(contrasts.tolist())
         response: Response = MtfTable(tuple(FREQUENCIES.tolist()), values, values)
         about = Stated(response, "stated", name)

@@ -267,15 +267,11 @@ def outside_width(cases: Cases, share: float = 0.25) -> float:
     return family_quantile(tested.errors(fit(cases.only(~large))), tested.families)
 
 
-def by_network(rows: Iterable[LeftOut], *, signed: bool = False) -> Array:
-    """Return the mean |predicted / published - 1| of each network over configurations and rates.
-
-    With `signed` the errors keep their sign.
-    """
+def by_network(rows: Iterable[LeftOut]) -> Array:
+    """Return the mean |predicted / published - 1| of each network over configurations and rates."""
     by_name: dict[str, list[float]] = {}
     for row in rows:
-        off = np.expm1(row.rates)
-        by_name.setdefault(row.network, []).extend((off if signed else np.abs(off)).tolist())
+        by_name.setdefault(row.network, []).extend(np.abs(np.expm1(row.rates)).tolist())
     return np.array([np.mean(values) for values in by_name.values()])
 
 
