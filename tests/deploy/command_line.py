@@ -20,4 +20,6 @@ def done(command: object, *words: object, code: int = 0) -> str:
 
 def refused(*words: object) -> str:
     """Return the output of a command that ends with 2, with single spaces between words."""
-    return " ".join(done(*words, code=2).split())
+    output = done(*words, code=2)
+    assert "Traceback" not in output
+    return " ".join(output.split())

@@ -11,7 +11,6 @@ import tifffile
 from PIL import Image
 from typer.core import TyperGroup
 from typer.main import get_command
-from typer.testing import CliRunner
 
 from beers_deploy import __version__
 from beers_deploy.cli.commands import COMMANDS, app
@@ -25,20 +24,6 @@ def acquisition(path: Path, height: int = 37, width: int = 61) -> Path:
     dn = np.random.default_rng(0).integers(200, 1800, (height, width))
     tifffile.imwrite(path, dn.astype(np.uint16))
     return path
-
-
-def fails(arguments: list[str], *words: str) -> None:
-    """Check that a command ends with 2 and one message with these words, without a traceback."""
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 2, result.output
-    *log, message = result.stderr.strip().splitlines()
-    assert message.startswith("beers-deploy: ")
-    assert message.endswith(".")
-    assert not any(line.startswith("beers-deploy: ") for line in log)
-    assert "Traceback" not in result.stderr
-    assert "`" not in message, "a parameter in place of an option"
-    for word in words:
-        assert word in message
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -142,7 +127,11 @@ def test_a_photograph_is_no_raw_image_until_its_scale_is_named(tmp_path: Path) -
     picture = tmp_path / "photo.jpg"
     out = tmp_path / "out.tif"
     Image.fromarray(np.random.default_rng(0).integers(0, 256, (40, 50, 3), np.uint8)).save(picture)
-    fails(["restore", str(picture), str(out)], "--full-scale")
+    message = refused("restore", picture, out)
+    assert message.count("beers-deploy: ") == 1
+    assert message.endswith(".")
+    assert "--full-scale" in message
+    assert "`" not in message, "a parameter in place of an option"
     assert not out.exists()
     done(f"restore {picture} {out} --full-scale 255")
     restored = tifffile.imread(out)

@@ -79,10 +79,9 @@ def resume(scene: Path, folder: Path, dataset: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_bytes_do_not_depend_on_the_workers(scene: Path, tmp_path: Path) -> None:
-    for workers in (1, 2):
-        write_dataset(small(scene), tmp_path / str(workers), workers, resume=False)
-    assert bytes_of(tmp_path / "1") == bytes_of(tmp_path / "2")
+def test_the_bytes_do_not_depend_on_the_workers(scene: Path, dataset: Path, tmp_path: Path) -> None:
+    write_dataset(small(scene), tmp_path, 2, resume=False)
+    assert bytes_of(tmp_path) == bytes_of(dataset)
 
 
 def test_any_patch_can_be_simulated_again_alone(scene: Path, dataset: Path) -> None:
@@ -110,14 +109,7 @@ def test_the_manifest_records_the_origin_of_each_patch(scene: Path, dataset: Pat
 def test_a_killed_dataset_is_resumed_to_the_same_bytes(scene: Path, tmp_path: Path) -> None:
     options = f"--images {scene} --oversampling 2 --patch 8 --workers 1".split()
     unbroken, killed = (tmp_path / name for name in ("whole", "killed"))
-    command = [
-        sys.executable,
-        "-c",
-        "from beers_deploy.cli.commands import app; app()",
-        "simulate",
-        *options,
-        "--out",
-    ]
+    command = [sys.executable, "-m", "beers_deploy", "simulate", *options, "--out"]
     subprocess.run([*command, str(unbroken)], check=True, capture_output=True)
     with subprocess.Popen(
         [*command, str(killed)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL

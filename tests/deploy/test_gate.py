@@ -18,7 +18,7 @@ from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.limits import Limits, judge
-from beers_deploy.quant.onnx_file import load_onnx, save_onnx
+from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.structure import Relus, count_relus, rounded_tensors, saturated_shares
@@ -41,13 +41,10 @@ def unseen() -> Patches:
     return drawn(2, seed=7, scene=77)
 
 
-def failed_checks(
-    reference_model: onnx.ModelProto, unseen: Patches, folder: Path, corrupt: Corrupt
-) -> set[str]:
+def failed_checks(reference_model: onnx.ModelProto, unseen: Patches, corrupt: Corrupt) -> set[str]:
     """Return the names of the checks that a corrupted copy of the shipped file fails."""
     model = onnx.load(shipped_pair("convbeers-xs")[1])
     corrupt(model)
-    save_onnx(model, folder / "corrupted.onnx")
     result = compare(open_session(reference_model), open_session(model), unseen)
     limits = Limits(std_over_mae=2.5, saturated=0.001)
     checks = judge(result, limits, shares=saturated_shares(model, unseen.degraded))
@@ -102,10 +99,8 @@ def clip_an_activation(model: onnx.ModelProto) -> None:
     node(model, "body.1.second").input[1] = fine
 
 
-def test_the_shipped_file_passes(
-    reference_model: onnx.ModelProto, unseen: Patches, tmp_path: Path
-) -> None:
-    assert failed_checks(reference_model, unseen, tmp_path, lambda _: None) == set()
+def test_the_shipped_file_passes(reference_model: onnx.ModelProto, unseen: Patches) -> None:
+    assert failed_checks(reference_model, unseen, lambda _: None) == set()
 
 
 @pytest.mark.parametrize(
@@ -136,9 +131,8 @@ def test_a_corrupted_file_fails(
     checks: set[str],
     reference_model: onnx.ModelProto,
     unseen: Patches,
-    tmp_path: Path,
 ) -> None:
-    assert checks <= failed_checks(reference_model, unseen, tmp_path, corrupt)
+    assert checks <= failed_checks(reference_model, unseen, corrupt)
 
 
 def test_without_8_bit_results_a_limit_on_them_fails() -> None:
@@ -214,12 +208,9 @@ def test_results_that_are_never_below_zero_need_no_relu() -> None:
     assert [relus.off_by(count) for count in range(6)] == [1, 0, 0, 0, 1, 2]
 
 
-def test_a_file_of_another_quantizer_is_judged_without_the_rules_of_a_dpu(
-    model: Path, tmp_path: Path
-) -> None:
-    path = quantized_freely(model, tmp_path / "free.onnx", per_channel=True)
+def test_a_file_of_another_quantizer_is_judged_without_the_rules_of_a_dpu(model: Path) -> None:
     reference_model = load_onnx(model)
-    free = Network(onnx.load(path), "free", path)
+    free = Network(quantized_freely(reference_model, per_channel=True), "free")
     checks = file_checks(reference_model, free, TargetProfile.load("host-cpu"))
     assert [(c.name, c.passed) for c in checks] == [
         ("ReLUs lost or added", True),
@@ -234,16 +225,9 @@ def test_a_file_of_another_quantizer_is_judged_without_the_rules_of_a_dpu(
     assert rules == "nodes the DPU refuses"
 
 
-def test_two_networks_of_one_kind_are_refused(
-    reference_model: onnx.ModelProto, tmp_path: Path
-) -> None:
-    path = tmp_path / "float.onnx"
-    save_onnx(reference_model, path)
-    for pair, expected in (
-        ([path, path], "an INT8"),
-        ([shipped_pair("convbeers-xs")[1]] * 2, "a float"),
-    ):
-        assert f"must be {expected} network" in refused("gate", *pair)
+def test_two_networks_of_one_kind_are_refused() -> None:
+    for path, expected in zip(shipped_pair("convbeers-xs"), ("an INT8", "a float"), strict=True):
+        assert f"must be {expected} network" in refused("gate", path, path)
 
 
 def test_samples_without_references_have_no_loss_and_no_limit_on_it(

@@ -94,19 +94,8 @@ def test_a_gate_on_a_network_gone_wrong_still_writes_json(value: float, tmp_path
     """If a network returns NaN, the MAE is unavailable with a reason, in valid JSON."""
     coverage = SampleRange(0, 0, 1, 1, 0)
     spread = Spread(np.ones(1), np.zeros(1), np.zeros(1))
-    result = GateResult(
-        value,
-        value,
-        value,
-        value,
-        value,
-        value,
-        value,
-        value,
-        patches=1,
-        sample_range=coverage,
-        spread=spread,
-    )
+    values: Any = [*[value] * 8, 1, coverage, spread]
+    result = GateResult(*values)
     checks = tuple(judge(result, Limits(mae=1.0)))
     Table("gate", {}, (), (gate_row(result),), checks).save(tmp_path / "gate.json")
     jsonschema.validate(strictly((tmp_path / "gate.json").read_text()), SCHEMA)

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 from unittest.mock import patch
 
@@ -196,8 +197,10 @@ class Calibration(CalibrationDataReader):  # type: ignore[misc]  # onnxruntime h
         return next(({"image": image} for image in self._images), None)
 
 
-def quantized_freely(source: Path, path: Path, **options: Any) -> Path:
-    """Write a float network to `path` as onnxruntime quantises it, calibrated on noise."""
+def quantized_freely(model: onnx.ModelProto, **options: Any) -> onnx.ModelProto:
+    """Return a float network as onnxruntime quantises it, calibrated on noise."""
     noise = list(np.random.default_rng(0).random((2, 1, 1, 32, 32), np.float32))
-    quantize_static(source, path, Calibration(noise), **options)
-    return path
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "free.onnx"
+        quantize_static(copied(model), path, Calibration(noise), **options)
+        return onnx.load(path)

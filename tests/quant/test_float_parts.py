@@ -1,14 +1,12 @@
 """A file that hides a float network around an integer core does not pass as INT8."""
 
-from pathlib import Path
-
 import numpy as np
 import onnx
 import pytest
 from numpy.typing import ArrayLike
 
 from beers_deploy.quant.float_parts import float_layers_check, float_note
-from beers_deploy.quant.onnx_file import load_onnx, save_onnx
+from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.structure import structure_checks
 from tests.quant.quick import quantized_freely
 from tests.quant.simplify.networks import parsed
@@ -57,16 +55,12 @@ def test_a_file_of_ours_has_none(name: str) -> None:
 
 @pytest.mark.parametrize("per_channel", [False, True])
 def test_a_file_of_another_quantizer_has_none(
-    per_channel: bool, float_onnx: onnx.ModelProto, tmp_path: Path
+    per_channel: bool, float_onnx: onnx.ModelProto
 ) -> None:
-    save_onnx(float_onnx, tmp_path / "float.onnx")
-    free = quantized_freely(
-        tmp_path / "float.onnx", tmp_path / "free.onnx", per_channel=per_channel
-    )
-    assert float_layers_check(load_onnx(free)).passed
+    assert float_layers_check(quantized_freely(float_onnx, per_channel=per_channel)).passed
 
 
-def test_one_float_layer_is_reported(tmp_path: Path) -> None:
+def test_one_float_layer_is_reported() -> None:
     generator = np.random.default_rng(0)
     shapes = {"first": (4, 1, 3, 3), "second": (1, 4, 3, 3)}
     model = parsed(
@@ -76,9 +70,6 @@ def test_one_float_layer_is_reported(tmp_path: Path) -> None:
         "float[N,1,H,W] image => float[N,1,H,W] y",
         constants={name: generator.normal(0, 0.2, shape) for name, shape in shapes.items()},
     )
-    save_onnx(model, tmp_path / "float.onnx")
-    partly = quantized_freely(
-        tmp_path / "float.onnx", tmp_path / "free.onnx", nodes_to_exclude=["kept"]
-    )
-    checks = {check.name: check for check in structure_checks(model, load_onnx(partly))}
+    partly = quantized_freely(model, nodes_to_exclude=["kept"])
+    checks = {check.name: check for check in structure_checks(model, partly)}
     assert not checks["layers computed in float"].passed

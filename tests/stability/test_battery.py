@@ -9,7 +9,6 @@ import numpy as np
 import onnx
 import pytest
 
-from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.restoration.plan import make_plan
@@ -78,11 +77,6 @@ def shipped() -> Subject:
     return open_subject("convbeers-xs")
 
 
-def one_nan(weight: np.ndarray) -> np.ndarray:
-    weight.ravel()[4] = np.nan
-    return weight
-
-
 @pytest.mark.parametrize(
     ("name", "change", "case", "check"),
     [
@@ -99,26 +93,16 @@ def test_a_broken_float_network_fails(
     case: str,
     check: str,
     float_onnx: onnx.ModelProto,
-    tmp_path: Path,
 ) -> None:
-    save_onnx(changed(float_onnx, name, change), tmp_path / "broken.onnx")
-    (result,) = run_cases(open_subject(tmp_path / "broken.onnx"), [case], ("float32",))
+    broken = open_subject(changed(float_onnx, name, change))
+    (result,) = run_cases(broken, [case], ("float32",))
     assert any(measure.check.startswith(check) for measure in result.failed), result.verdict
 
 
-def test_a_network_with_a_nan_among_its_weights_is_not_opened(
-    float_onnx: onnx.ModelProto, tmp_path: Path
-) -> None:
-    save_onnx(changed(float_onnx, "body.0.second.weight", one_nan), tmp_path / "broken.onnx")
-    with pytest.raises(ModelError, match=r"body\.0\.second\.weight has 1 NaN or infinite"):
-        open_subject(tmp_path / "broken.onnx")
-
-
-def test_a_broken_int8_network_fails(pair: list[Path], tmp_path: Path) -> None:
-    corrupted = changed(onnx.load(pair[1]), "tail.bias", lambda bias: bias + 10_000_000)
-    save_onnx(corrupted, tmp_path / "broken.onnx")
-    results = run_cases(open_subject(pair[0], tmp_path / "broken.onnx"), ["deciles"], ("INT8",))
-    assert {"mean moved"} <= {measure.check for measure in results[0].failed}
+def test_a_broken_int8_network_fails(pair: list[Path]) -> None:
+    broken = changed(onnx.load(pair[1]), "tail.bias", lambda bias: bias + 10_000_000)
+    (result,) = run_cases(open_subject(pair[0], broken), ["deciles"], ("INT8",))
+    assert "mean moved" in {measure.check for measure in result.failed}
 
 
 @pytest.mark.parametrize(("bands", "block"), [(3, 1), (1, 2)])

@@ -2,13 +2,12 @@
 the DPU cannot compute.
 """
 
-from pathlib import Path
-
 import numpy as np
+import onnx
 import pytest
 from onnxruntime.quantization import QuantFormat, QuantType
 
-from tests.deploy.dpu.draws import placed_file, rules_of
+from tests.deploy.dpu.draws import placed, rules_of
 from tests.deploy.dpu.graphs import Sketch
 from tests.quant.quick import quantized_freely
 
@@ -27,32 +26,14 @@ class RandomSketch(Sketch):
         return self.node("Conv", source, self.weight(*shape), self.weight(shape[0]), pads=[1] * 4)
 
 
-def float_file(path: Path) -> Path:
-    """Write convolutions with bias, a residual add, a pool and a transposed convolution."""
+def float_network() -> onnx.ModelProto:
+    """Build convolutions with bias, a residual add, a pool and a transposed convolution."""
     s = RandomSketch(1)
     head = s.biased("image", 8, 1, 3, 3)
     stream = s.node("Add", head, s.biased(s.node("Relu", s.biased(head, 8, 8, 3, 3)), 8, 8, 3, 3))
     pooled = s.node("MaxPool", stream, kernel_shape=[2, 2], strides=[2, 2])
     up = s.node("ConvTranspose", pooled, s.weight(8, 8, 4, 4), strides=[2, 2], pads=[1] * 4)
-    return s.save(path, s.biased(s.node("LeakyRelu", up, alpha=26 / 256), 1, 8, 3, 3))
-
-
-def quantized(
-    path: Path,
-    form: QuantFormat,
-    kind: QuantType,
-    per_channel: bool = False,
-    symmetric: bool = False,
-) -> Path:
-    return quantized_freely(
-        float_file(path.with_name("f.onnx")),
-        path,
-        quant_format=form,
-        per_channel=per_channel,
-        activation_type=kind,
-        weight_type=QuantType.QInt8,
-        extra_options={"ActivationSymmetric": symmetric},
-    )
+    return s.model(s.biased(s.node("LeakyRelu", up, alpha=26 / 256), 1, 8, 3, 3))
 
 
 @pytest.mark.parametrize(
@@ -65,11 +46,18 @@ def quantized(
     ],
 )
 def test_onnxruntimes_files_are_refused_only_for_their_scales_and_types(
-    tmp_path: Path, form: QuantFormat, kind: QuantType, per_channel: bool
+    form: QuantFormat, kind: QuantType, per_channel: bool
 ) -> None:
     signed = kind == QuantType.QInt8
-    path = quantized(tmp_path / "q.onnx", form, kind, per_channel, signed)
-    nodes = placed_file(path, TILE_PX).nodes
+    theirs = quantized_freely(
+        float_network(),
+        quant_format=form,
+        per_channel=per_channel,
+        activation_type=kind,
+        weight_type=QuantType.QInt8,
+        extra_options={"ActivationSymmetric": signed},
+    )
+    nodes = placed(theirs, TILE_PX).nodes
     expected = (
         {"power of two"}
         | ({"per tensor"} if per_channel else set())

@@ -102,16 +102,7 @@ def pair_of_bands() -> bd.Pair:
 
 def begin(image: Path, out: Path, *options: object) -> subprocess.Popen[str]:
     """Start a run on one thread."""
-    command = [
-        sys.executable,
-        "-c",
-        "from beers_deploy.cli.commands import app; app()",
-        "restore",
-        image,
-        out,
-        "--threads",
-        1,
-    ]
+    command = [sys.executable, "-m", "beers_deploy", "restore", image, out, "--threads", 1]
     return subprocess.Popen(
         list(map(str, [*command, *options])),
         stdout=subprocess.PIPE,
