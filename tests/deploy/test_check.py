@@ -11,7 +11,14 @@ from beers_deploy.quant.graph import read_network
 from beers_deploy.quant.graph.split_network import REMEDY
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
-from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
+from tests.deploy.dpu.graphs import (
+    MYSTERY,
+    SAME,
+    board_convbeers,
+    float_convbeers,
+    integer_convbeers,
+    written,
+)
 from tests.quant.quick import fix_sizes
 
 
@@ -42,11 +49,9 @@ def test_a_network_of_one_tile_is_checked_at_that(tmp_path: Path) -> None:
 
 
 def test_the_document_contains_subgraphs_cuts_and_remarks(tmp_path: Path) -> None:
-    sketch = Sketch(8)
-    path = sketch.save(
-        tmp_path / "bad.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image")))
-    )
-    output = done(f"check {path} --tile 96 --json {tmp_path}/o.json", code=1)
+    nodes = f"a = {SAME}(image, w) b = Sigmoid(a) y = {SAME}(b, w)"
+    onnx.save(written(nodes), tmp_path / "bad.onnx")
+    output = done(f"check {tmp_path}/bad.onnx --tile 96 --json {tmp_path}/o.json", code=1)
     rows = tables(tmp_path / "o.json")
     assert [row["text"]["device"] for row in rows["subgraphs"]] == ["DPU", "CPU", "DPU"]
     assert [row["figures"]["size"]["value"] for row in rows["cuts"]] == [8 * 96 * 96] * 4
@@ -67,12 +72,9 @@ def test_the_document_contains_subgraphs_cuts_and_remarks(tmp_path: Path) -> Non
 
 def test_devices_and_refusals_are_shown_and_nodes_in_detail(tmp_path: Path) -> None:
     """Nodes are listed with -v only. Each broken rule has its count and a remedy."""
-    sketch = Sketch(8)
-    path = sketch.save(
-        tmp_path / "bad.onnx",
-        sketch.conv(sketch.node("Sigmoid", sketch.node("Sigmoid", sketch.conv("image")))),
-    )
-    command = f"check {path} --tile 96 --json {tmp_path}/o.json"
+    nodes = f"a = {SAME}(image, w) b = Sigmoid(a) c = Sigmoid(b) y = {SAME}(c, w)"
+    onnx.save(written(nodes), tmp_path / "bad.onnx")
+    command = f"check {tmp_path}/bad.onnx --tile 96 --json {tmp_path}/o.json"
     brief = done(command, code=1)
     rows = tables(tmp_path / "o.json")
     assert {row["name"]: row["figures"]["count"]["value"] for row in rows["devices"]} == {
@@ -92,10 +94,8 @@ def test_devices_and_refusals_are_shown_and_nodes_in_detail(tmp_path: Path) -> N
 
 
 def test_an_unknown_size_is_not_shown_as_zero(tmp_path: Path) -> None:
-    sketch = Sketch(4)
-    odd = sketch.node("Mystery", sketch.conv("image", (4, 4, 3, 3)), domain="com.microsoft")
-    path = sketch.save(tmp_path / "m.onnx", sketch.conv(odd, (4, 4, 3, 3)))
-    output = done(f"check {path} --json {tmp_path}/o.json", code=1)
+    onnx.save(written(MYSTERY), tmp_path / "m.onnx")
+    output = done(f"check {tmp_path}/m.onnx --json {tmp_path}/o.json", code=1)
     modes = [row["figures"]["size"]["mode"] for row in tables(tmp_path / "o.json")["cuts"]]
     assert modes.count("unavailable") == 2
     assert "its shape is unknown" in output

@@ -7,6 +7,8 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from tests.quant.simplify.networks import parsed
+
 Value = int | float | str | list[int]
 
 
@@ -53,6 +55,29 @@ class Sketch:
     def save(self, path: Path, *results: str) -> Path:
         onnx.save_model(self.model(*results), path)
         return path
+
+
+SAME = "Conv<pads=[1,1,1,1]>"
+MYSTERY = f"a = {SAME}(image, w) b = com.microsoft.Mystery(a) y = {SAME}(b, w)"
+"""An operator that nobody knows, between two convolutions."""
+
+
+def written(
+    nodes: str, channels: int = 8, results: tuple[str, ...] = ("y",), **shapes: tuple[int, ...]
+) -> onnx.ModelProto:
+    """Return a float network from `image`, in ONNX's text format.
+
+    Args:
+        nodes: they may read `w`, weights of 3 x 3 for 8 channels, and `eight`, the factors of an
+            enlargement.
+        channels: the number of channels of the image.
+        results: the names of the outputs.
+        shapes: the shapes of other weights, which are all 0.
+    """
+    weights = {name: np.zeros(shape) for name, shape in shapes.items()}
+    constants = {"w": np.zeros((8, 8, 3, 3)), "eight": [1.0, 1.0, 8.0, 8.0], **weights}
+    outputs = ", ".join(f"float[N,C,P,Q] {name}" for name in results)
+    return parsed(nodes, f"float[N,{channels},H,W] image => {outputs}", constants=constants)
 
 
 def float_convbeers(path: Path, blocks: int, features: int) -> Path:

@@ -36,7 +36,7 @@ from tests.deploy.dpu.draws import (
     doubled,
     in_two,
 )
-from tests.deploy.dpu.graphs import Sketch
+from tests.deploy.dpu.graphs import Sketch, written
 from tests.shipped import shipped_pair
 
 DPUS = {name: load_dpu(name) for name in board_names()}
@@ -130,8 +130,7 @@ def test_which_boards_accept_an_operator(draw: Draw, boards: set[str]) -> None:
 
 
 def test_a_smaller_dpu_accepts_fewer_channels() -> None:
-    sketch = Sketch(8)
-    model = sketch.model(sketch.conv("image", (2049, 8, 1, 1)))
+    model = written("y = Conv(image, wide)", wide=(2049, 8, 1, 1))
     for size, rules in (("B512", ["conv channels"]), ("B1152", []), (None, [])):
         assert broken_rules(model, dpu=load_dpu("zcu102", size)) == rules
 

@@ -2,6 +2,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 
 from beers_deploy.dpu.board import load_dpu
@@ -12,7 +13,14 @@ from beers_deploy.dpu.cost.work import BURST_BYTES, Work, count_work
 from beers_deploy.performance.swath import predict_network
 from beers_deploy.profiles.errors import ModelError
 from tests.deploy.dpu.draws import DPU, placed
-from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
+from tests.deploy.dpu.graphs import (
+    SAME,
+    Sketch,
+    board_convbeers,
+    float_convbeers,
+    integer_convbeers,
+    written,
+)
 
 PAPER_FPS = 7.2
 
@@ -70,9 +78,9 @@ def test_unused_rows_columns_and_channels_of_the_array_take_time_too(
     assert wide.array_use == 2 * 9 * 40**2 * 97**2 / wide.array_operations
 
 
-def works_of(sketch: Sketch, result: str, side_px: int) -> tuple[Work, ...]:
-    """Return the work of each layer of a network that ends in `result`."""
-    return count_work(placed(sketch.model(result), side_px).core, DPU)
+def works_of(model: onnx.ModelProto, side_px: int) -> tuple[Work, ...]:
+    """Return the work of each layer of a network."""
+    return count_work(placed(model, side_px).core, DPU)
 
 
 def moved(works: tuple[Work, ...]) -> int:
@@ -88,7 +96,7 @@ def test_the_input_of_three_branches_passes_through_memory() -> None:
         s = Sketch(16)
         stem = s.conv("image", (16, 16, 3, 3))
         joined = s.node("Concat", *(s.conv(stem, (16, 16, 1, 1)) for _ in range(branches)), axis=1)
-        works = works_of(s, s.conv(joined, (8, 16 * branches, 1, 1)), 32)
+        works = works_of(s.model(s.conv(joined, (8, 16 * branches, 1, 1))), 32)
         maps[branches] = moved(works) / (16 * 32 * 32)
     image = 1
     result = 0.5
@@ -101,7 +109,7 @@ def test_the_inputs_of_a_concat_are_stored_in_bursts_and_loaded_again(
 ) -> None:
     s = Sketch(8)
     joined = s.node("Concat", *(s.conv("image", (count, 8, 3, 3)) for count in channels), axis=1)
-    works = works_of(s, s.conv(joined, (8, sum(channels), 1, 1)), 33)
+    works = works_of(s.model(s.conv(joined, (8, sum(channels), 1, 1))), 33)
     padded_channels = [BURST_BYTES * math.ceil(count / BURST_BYTES) for count in channels]
     assert [work.store_map_bytes for work in works] == [
         33 * 33 * count for count in (*padded_channels, 0, 8)
@@ -121,7 +129,7 @@ def test_an_add_of_maps_beyond_the_chip_loads_one_of_them(side: int, maps: int, 
         for _ in range(convs):
             x = s.conv(x, wide)
         last = s.conv(s.node("Add", x, first) if added else x, (8, 32, 1, 1))
-        sums.append(moved(works_of(s, last, side)))
+        sums.append(moved(works_of(s.model(last), side)))
     assert sums[1] - sums[0] == maps * 32 * side * side
 
 
@@ -141,11 +149,12 @@ def test_the_load_of_an_add_is_not_hidden(tmp_path: Path, board: str) -> None:
 def test_a_pixel_shuffle_costs_the_bursts_of_its_pieces(block: int) -> None:
     """The three channels of each pixel take a burst. The host shuffles at the network's end."""
     map_bytes = {}
-    for place_in, ends in (("end", True), ("middle", False)):
-        s = Sketch(3)
-        x = s.node("DepthToSpace", s.conv("image", (3 * block**2, 3, 3, 3)), blocksize=block)
-        works = works_of(s, x if ends else s.conv(x, (3, 3, 1, 1)), 512)
-        assert len(works) == (1 if ends else 2)
+    wide = (3 * block**2, 3, 3, 3)
+    nodes = f"a = {SAME}(image, wide) b = DepthToSpace<blocksize={block}>(a)"
+    for place_in, end, count in (("end", "Identity(b)", 1), ("middle", "Conv(b, last)", 2)):
+        model = written(f"{nodes} y = {end}", 3, wide=wide, last=(3, 3, 1, 1))
+        works = works_of(model, 512)
+        assert len(works) == count
         map_bytes[place_in] = works[0].store_map_bytes
     values = 3 * block**2 * 512 * 512
     assert map_bytes == {"end": values, "middle": values // 3 * BURST_BYTES}
@@ -159,15 +168,11 @@ def test_a_transposed_convolution_runs_as_one_convolution_for_each_phase(
 
     So the DPU computes no inserted zeros.
     """
-    grown = Sketch(32)
-    plain = Sketch(32)
-    window = {"strides": [stride] * 2, "pads": [0, 0, kernel - stride, kernel - stride]}
-    weights = grown.weight(32, 32, kernel, kernel)
-    enlarged = grown.node("ConvTranspose", "image", weights, **window)
-    (work,) = works_of(grown, enlarged, 64)
-    pads = [0, 0, taps - 1, taps - 1]
-    phase = plain.conv("image", (32, 32, taps, taps), pads=pads)
-    (other,) = works_of(plain, phase, 64)
+    window = f"strides={[stride] * 2}, pads={[0, 0, kernel - stride, kernel - stride]}"
+    grown = f"y = ConvTranspose<{window}>(image, up)"
+    (work,) = works_of(written(grown, 32, up=(32, 32, kernel, kernel)), 64)
+    phase = f"y = Conv<pads={[0, 0, taps - 1, taps - 1]}>(image, part)"
+    (other,) = works_of(written(phase, 32, part=(32, 32, taps, taps)), 64)
     assert work.array_operations == stride**2 * other.array_operations
     assert (work.array_operations == work.operations) is (kernel % stride == 0)
 
@@ -214,10 +219,8 @@ def test_a_share_is_how_much_the_rate_follows_the_part(contention_exponent: floa
 
 
 def test_a_network_without_convolutions_has_no_prediction() -> None:
-    sketch = Sketch(8)
-    model = sketch.model(sketch.node("MaxPool", "image", kernel_shape=[2, 2]))
     with pytest.raises(ModelError, match="no convolution"):
-        predict_network(model, DPU)
+        predict_network(written("y = MaxPool<kernel_shape=[2,2]>(image)"), DPU)
 
 
 @pytest.mark.parametrize(

@@ -3,14 +3,13 @@ import pytest
 from beers_deploy.dpu.checker.operators import forms, fully_connected
 from beers_deploy.dpu.checker.placement import PlacedNode
 from tests.deploy.dpu.draws import DPU, placed
-from tests.deploy.dpu.graphs import Sketch
+from tests.deploy.dpu.graphs import written
 
 
 def placed_conv(weight: tuple[int, ...], tile_px: int, *pads: int) -> PlacedNode:
     """Place a convolution over a map of `tile_px` pixels a side."""
-    sketch = Sketch(weight[1])
-    model = sketch.model(sketch.conv("image", weight, pads=[*pads] or [0] * 4))
-    return placed(model, tile_px).nodes[-1]
+    nodes = f"y = Conv<pads={[*pads] or [0] * 4}>(image, last)"
+    return placed(written(nodes, weight[1], last=weight), tile_px).nodes[-1]
 
 
 def test_a_layer_as_large_as_its_map_is_also_one_pixel_of_all_its_values() -> None:

@@ -31,7 +31,7 @@ from tests.deploy.dpu.draws import (
     scaled,
     transposed,
 )
-from tests.deploy.dpu.graphs import IntegerSketch, Sketch
+from tests.deploy.dpu.graphs import SAME, IntegerSketch, Sketch, written
 from tests.deploy.dpu.test_number_graphs import CASES as NUMBER_CASES
 
 NARROW_ARRAY = "C32B1"
@@ -209,9 +209,8 @@ def test_maps_of_the_sizes_of_a_tile(draw: Draw, tile_px: int, rules: list[str])
 
 def test_a_tile_that_the_memory_cannot_hold() -> None:
     """A tile whose maps exceed the memory is refused, and the remedy's factor makes it fit."""
-    sketch = Sketch(1)
-    wide = sketch.conv("image", (64, 1, 3, 3))
-    model = sketch.model(sketch.conv(wide, (1, 64, 3, 3)))
+    nodes = f"a = {SAME}(image, first) y = {SAME}(a, last)"
+    model = written(nodes, 1, first=(64, 1, 3, 3), last=(1, 64, 3, 3))
     tile_px = 7001
     (violation,) = placed(model, tile_px).nodes[0].broken
     assert violation.rule == "map in memory"
@@ -241,8 +240,7 @@ def test_a_float_convolution_in_a_quantized_file_is_refused() -> None:
 
 def test_findings_name_the_numbers_and_a_remedy() -> None:
     """A finding states the number that broke the rule, the limit, and what to do."""
-    sketch = Sketch(8)
-    model = sketch.model(sketch.conv("image", (8, 8, 17, 1)))
+    model = written("y = Conv<pads=[8,0,8,0]>(image, long)", long=(8, 8, 17, 1))
     (violation,) = placed(model).nodes[0].broken
     assert violation.finding.reason == "kernel (1 x 17) is not in the DPU's range 1 to 16"
     assert "at most 16" in violation.finding.remedy

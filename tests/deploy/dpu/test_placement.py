@@ -7,11 +7,12 @@ from beers_deploy.dpu.checker.placement import FLOAT_NOTE
 from beers_deploy.dpu.checker.remarks import remarks_on
 from tests.deploy.dpu.draws import DPU, placed, placed_file
 from tests.deploy.dpu.graphs import (
+    SAME,
     IntegerSketch,
-    Sketch,
     board_convbeers,
     float_convbeers,
     integer_convbeers,
+    written,
 )
 
 
@@ -39,39 +40,31 @@ def test_the_core_of_each_encoding_is_one_subgraph_between_host_parts(
 
 def test_a_branch_past_the_cpu_does_not_join_the_two_subgraphs() -> None:
     """The skip ends in the second subgraph. If both were one, it would wait for itself."""
-    sketch = Sketch(8)
-    first = sketch.conv("image")
-    end = sketch.node("Add", first, sketch.conv(sketch.node("Sigmoid", first)))
-    assert placed(sketch.model(end), 21).dpu_subgraphs == 2
+    nodes = f"a = {SAME}(image, w) b = Sigmoid(a) c = {SAME}(b, w) y = Add(a, c)"
+    assert placed(written(nodes), 21).dpu_subgraphs == 2
 
 
 def test_scaling_in_front_is_the_hosts_but_other_operators_are_refused() -> None:
-    sketch = Sketch(8)
-    scaled = sketch.node("Div", "image", sketch.weight(1))
-    placement = placed(sketch.model(sketch.conv(scaled)), 21)
+    placement = placed(written(f"a = Div(image, one) y = {SAME}(a, w)", one=(1,)), 21)
     assert [node.part for node in placement.nodes] == ["host-front", "dpu-core"]
-
-    sketch = Sketch(8)
-    apart = sketch.node("Softmax", "image", axis=1)
-    placement = placed(sketch.model(sketch.conv(apart)), 21)
+    placement = placed(written(f"a = Softmax<axis=1>(image) y = {SAME}(a, w)"), 21)
     assert [node.device for node in placement.nodes] == ["CPU", "DPU"]
 
 
 def test_pixels_are_moved_to_channels_and_back_by_the_host_at_the_ends_alone() -> None:
-    sketch = Sketch(2)
-    apart = sketch.conv(sketch.node("SpaceToDepth", "image", blocksize=2))
-    inside = sketch.conv(sketch.node("DepthToSpace", apart, blocksize=2), (8, 2, 3, 3))
-    placement = placed(sketch.model(sketch.node("DepthToSpace", inside, blocksize=2)), 20)
+    nodes = f"""
+        a = SpaceToDepth<blocksize=2>(image) b = {SAME}(a, w) c = DepthToSpace<blocksize=2>(b)
+        d = {SAME}(c, last) y = DepthToSpace<blocksize=2>(d)
+    """
+    placement = placed(written(nodes, 2, last=(8, 2, 3, 3)), 20)
     assert [node.part for node in placement.nodes] == ["host-front", *["dpu-core"] * 3, "host-back"]
     assert placement.failed == ()
     assert remarks_on(placement, DPU, 20)["shuffles"].startswith(placement.nodes[2].op.name)
 
 
 def test_the_host_computes_the_end_of_a_classifier() -> None:
-    sketch = Sketch(8)
-    pooled = sketch.node("GlobalAveragePool", sketch.conv("image"))
-    scores = sketch.node("Gemm", sketch.node("Flatten", pooled), sketch.weight(8, 3))
-    model = sketch.model(sketch.node("Softmax", scores, axis=1))
+    nodes = f"a = {SAME}(image, w) b = GlobalAveragePool(a) c = Flatten(b) d = Gemm(c, last)"
+    model = written(f"{nodes} y = Softmax<axis=1>(d)", last=(8, 3))
     del model.graph.output[0].type.tensor_type.shape.dim[2:]
     kinds = [(node.op.op_type, node.part) for node in placed(model, 21).nodes]
     assert kinds[:3] == [(kind, "dpu-core") for kind in ("Conv", "GlobalAveragePool", "Conv")]

@@ -1,15 +1,14 @@
 from pathlib import Path
 
-import numpy as np
+import onnx
 import pytest
-from onnx import numpy_helper
 from onnx.helper import set_model_props
 
 from beers_deploy.dpu.reading import own_tile_px, read_network, usual_tile_px
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.encodings import BORDER_PX, PLACE_PX, board_model
 from beers_deploy.quant.onnx_file import metadata, save_onnx
-from tests.deploy.dpu.graphs import Sketch, board_convbeers
+from tests.deploy.dpu.graphs import MYSTERY, SAME, board_convbeers, written
 from tests.quant.quick import fix_sizes
 from tests.quant.tiling.small_networks import quantized_half_resolution
 
@@ -28,31 +27,28 @@ def test_a_board_file_keeps_only_the_conversions_at_its_border_and_its_numbers(
 
 
 def test_an_unknown_operator_hides_the_shape_but_not_the_network(tmp_path: Path) -> None:
-    sketch = Sketch(4)
-    odd = sketch.node("Mystery", sketch.conv("image", (4, 4, 3, 3)), domain="com.microsoft")
-    path = sketch.save(tmp_path / "m.onnx", sketch.conv(odd, (4, 4, 3, 3)))
-    after = read_network(path, 30).operations[-1]
+    onnx.save(written(MYSTERY), tmp_path / "m.onnx")
+    after = read_network(tmp_path / "m.onnx", 30).operations[-1]
     assert after.out_shape is None
     with pytest.raises(ModelError, match="hides the shape"):
         _ = after.operations
 
 
 def test_a_model_fixed_to_another_tile_is_refused_with_its_tile(tmp_path: Path) -> None:
-    sketch = Sketch(2)
-    fix_sizes(sketch.input, 48, 48)
-    path = sketch.save(tmp_path / "f.onnx", sketch.conv("image", (2, 2, 3, 3)))
-    assert read_network(path, 48).operations[0].out_shape == (2, 48, 48)
+    model = written(f"y = {SAME}(image, w)")
+    fix_sizes(model.graph.input[0], 48, 48)
+    onnx.save(model, tmp_path / "f.onnx")
+    assert read_network(tmp_path / "f.onnx", 48).operations[0].out_shape == (8, 48, 48)
     with pytest.raises(ModelError, match="`tile` 48"):
-        read_network(path, 640)
+        read_network(tmp_path / "f.onnx", 640)
 
 
 def test_inputs_that_are_no_images_are_refused(tmp_path: Path) -> None:
-    sketch = Sketch(2)
-    del sketch.input.type.tensor_type.shape.dim[3]
-    sketch.constants.append(numpy_helper.from_array(np.zeros(1, np.float32), "one"))
-    path = sketch.save(tmp_path / "i.onnx", sketch.node("Add", "image", "one"))
+    model = written("y = Add(image, one)", one=(1,))
+    del model.graph.input[0].type.tensor_type.shape.dim[3]
+    onnx.save(model, tmp_path / "i.onnx")
     with pytest.raises(ModelError, match="inputs"):
-        read_network(path)
+        read_network(tmp_path / "i.onnx")
 
 
 @pytest.mark.parametrize("on_board", [False, True])

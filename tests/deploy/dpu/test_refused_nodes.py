@@ -13,21 +13,17 @@ from beers_deploy.performance.swath import float_work, predict_network
 from beers_deploy.performance.tables import host_words
 from beers_deploy.profiles.errors import ModelError
 from tests.deploy.dpu.draws import DPU, placed
-from tests.deploy.dpu.graphs import IntegerSketch, Sketch
+from tests.deploy.dpu.graphs import SAME, IntegerSketch, written
 from tests.quant.quick import patches_of, quickly
 from tests.quant.test_host_end import float_network
 
 
 def segmenter(where: str, behind: str = "") -> onnx.ModelProto:
     """Build a network that enlarges scores of 19 classes from an eighth of the size."""
-    sketch = Sketch(3)
-    deep = sketch.conv("image", (32, 3, 3, 3), strides=[8, 8])
-    scores = sketch.conv(deep, (19, 32, 1, 1))
-    sizes = sketch.constant(np.array([1, 1, 8, 8], np.float32))
-    last = sketch.node(
-        "Resize", scores, "", sizes, mode="linear", coordinate_transformation_mode=where
-    )
-    return sketch.model(sketch.node(behind, last) if behind else last)
+    nodes = "a = Conv<pads=[1,1,1,1], strides=[8,8]>(image, first) b = Conv(a, last)"
+    large = f'Resize<mode="linear", coordinate_transformation_mode="{where}">(b, , eight)'
+    end = f"c = {large} y = {behind}(c)" if behind else f"y = {large}"
+    return written(f"{nodes} {end}", 3, first=(32, 3, 3, 3), last=(19, 32, 1, 1))
 
 
 def predicted(where: str) -> Prediction:
@@ -51,17 +47,14 @@ def test_nodes_behind_a_refused_node_stay_on_the_processor() -> None:
 
 
 def test_a_refused_node_in_front_also_runs_on_the_processor() -> None:
-    sketch = Sketch(8)
-    model = sketch.model(sketch.conv(sketch.node("Softmax", "image", axis=1)))
-    assert predict_network(model, DPU, 20).refused == (sketch.nodes[0].name,)
+    model = written(f"a = Softmax<axis=1>(image) y = {SAME}(a, w)")
+    assert predict_network(model, DPU, 20).refused == (model.graph.node[0].name,)
 
 
 def test_between_two_convolutions_of_the_dpu_there_is_no_prediction() -> None:
-    sketch = Sketch(8)
-    skip = sketch.conv("image")
-    summed = sketch.node("Add", skip, sketch.node("Softmax", skip, axis=1))
-    with pytest.raises(ModelError, match="softmax"):
-        predict_network(sketch.model(sketch.conv(summed)), DPU, 20)
+    nodes = f"a = {SAME}(image, w) b = Softmax<axis=1>(a) c = Add(a, b) y = {SAME}(c, w)"
+    with pytest.raises(ModelError, match="Softmax"):
+        predict_network(written(nodes), DPU, 20)
 
 
 def test_numbers_that_the_dpu_refuses_are_no_work_for_the_processor() -> None:
@@ -104,12 +97,13 @@ def heads() -> onnx.ModelProto:
 
     It first moves the image's pixels to channels.
     """
-    sketch = Sketch(3)
-    apart = sketch.node("SpaceToDepth", "image", blocksize=2)
-    half = sketch.conv(apart, (16, 12, 3, 3))
-    quarter = sketch.conv(half, (32, 16, 3, 3), strides=[2, 2])
-    results = [sketch.conv(half, (255, 16, 1, 1)), sketch.conv(quarter, (255, 32, 1, 1))]
-    return sketch.model(*(sketch.node("Sigmoid", result) for result in results))
+    nodes = f"""
+        a = SpaceToDepth<blocksize=2>(image) b = {SAME}(a, first)
+        c = Conv<pads=[1,1,1,1], strides=[2,2]>(b, second)
+        d = Conv(b, half) y = Sigmoid(d) e = Conv(c, quarter) z = Sigmoid(e)
+    """
+    wide = {"first": (16, 12, 3, 3), "second": (32, 16, 3, 3)}
+    return written(nodes, 3, ("y", "z"), **wide, half=(255, 16, 1, 1), quarter=(255, 32, 1, 1))
 
 
 def test_several_heads_are_copied_and_are_no_image() -> None:
@@ -123,10 +117,10 @@ def test_several_heads_are_copied_and_are_no_image() -> None:
 
 
 def test_results_of_few_bands_become_an_image_and_scores_do_not() -> None:
+    nodes = f"a = {SAME}(image, last) y = DepthToSpace<blocksize=2>(a)"
     for channels, task in ((12, "image"), (76, "copy")):
-        sketch = Sketch(3)
-        last = sketch.node("DepthToSpace", sketch.conv("image", (channels, 3, 3, 3)), blocksize=2)
-        assert predict_network(sketch.model(last), DPU, 64).task == task
+        model = written(nodes, 3, last=(channels, 3, 3, 3))
+        assert predict_network(model, DPU, 64).task == task
 
 
 def test_what_the_host_computes_in_float_takes_time_in_both_files() -> None:
