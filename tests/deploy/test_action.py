@@ -2,7 +2,6 @@
 a missing one. Their steps run in a shell.
 """
 
-import json
 import shutil
 import subprocess
 import sys
@@ -17,6 +16,7 @@ from beers_deploy.model.shipped import SENSOR
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.onnx_file import save_onnx
 from tests.deploy.command_line import done
+from tests.deploy.documents import valid
 from tests.deploy.workflow_steps import ACTION, BASH, KEPT, Runner, read_yaml
 from tests.model.networks import plain
 from tests.project_files import ROOT, text_of
@@ -82,7 +82,7 @@ def test_a_valid_pair_is_green(runner: Runner, networks: Path) -> None:
     )
     assert "| MAE | 0.000" in runner.summary.read_text()
     assert suite(runner.folder / "made" / "j.xml").get("failures") == "0"
-    assert json.loads((runner.folder / "gate.json").read_text())["verdict"] == "passed"
+    assert valid(runner.folder / "gate.json")["verdict"] == "passed"
 
 
 def test_a_broken_pair_is_red(runner: Runner, networks: Path) -> None:
@@ -138,7 +138,7 @@ def test_without_an_int8_network_it_quantizes_for_the_same_sensor(
     calls = runner.calls.read_text().splitlines()
     assert [call.split()[0] for call in calls] == ["quantize", "gate"]
     assert all("--target vck190 --sensor mine.toml" in call for call in calls)
-    arguments = json.loads((runner.folder / "gate.json").read_text())["arguments"]
+    arguments = valid(runner.folder / "gate.json")["arguments"]
     assert (arguments["sensor"], arguments["max_mae"]) == ("mine", 0.001)
 
 

@@ -1,14 +1,12 @@
 """Tests of the names of `import beers_deploy`: arguments, results, and errors for bad input."""
 
 import copy
-import json
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 import onnx
 import pytest
@@ -20,7 +18,7 @@ import beers_deploy as bd
 from beers_deploy.model.shipped import shipped_names
 from beers_deploy.profiles.sensor_numbers import numbers_of
 from beers_deploy.profiles.shipped import board_names, sensor_names
-from beers_deploy.results import SCHEMA_PATH
+from tests.deploy.documents import valid
 from tests.deploy.restoration.runs import simulated
 
 SMALL = "convbeers-xs"
@@ -167,8 +165,7 @@ def test_a_board_runs_a_network_at_a_predicted_speed(int8: bd.Network) -> None:
 
 def test_a_table_is_a_document_and_shows_itself(int8: bd.Network, tmp_path: Path) -> None:
     table = bd.bench(int8, target="all", traditional=False)
-    document = json.loads(table.save(tmp_path / "figures.json").read_text())
-    jsonschema.validate(document, json.loads(SCHEMA_PATH.read_text(encoding="utf-8")))
+    document = valid(table.save(tmp_path / "figures.json"))
     assert document["inputs"][0]["sha256"] == int8.sha256
     assert document == {**table.to_dict(), "host": document["host"]}
     page = table._repr_html_()

@@ -25,6 +25,7 @@ from beers_deploy.quant.samples.own import CALIBRATED_ON
 from beers_deploy.quant.sensor_bank.conditioned import WEIGHTS
 from beers_deploy.results import Table
 from tests.deploy.command_line import done, refused
+from tests.deploy.documents import valid
 from tests.quant.quick import change
 from tests.shipped import shipped_pair
 
@@ -54,7 +55,7 @@ def test_the_digest_is_that_of_the_bytes_that_were_judged(
 
     monkeypatch.setattr(comparison, "differences_of", replaced)
     done(f"gate --patches 1 --json {tmp_path}/g.json --record {tmp_path}/r", *pair)
-    document = json.loads((tmp_path / "g.json").read_text())
+    document = valid(tmp_path / "g.json")
     assert {entry["name"]: entry["sha256"] for entry in document["inputs"]}["int8.onnx"] == before
     assert json.loads((tmp_path / "r" / "record.json").read_text())["network"]["sha256"] == before
 

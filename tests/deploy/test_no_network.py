@@ -4,7 +4,6 @@ Most run in this process, where Python's sockets are replaced. Some run in a pro
 where the kernel also stops sockets of native libraries (tests/deploy/sealed.py).
 """
 
-import json
 import os
 import platform
 import signal
@@ -21,6 +20,7 @@ from typer.testing import CliRunner
 from beers_deploy.cli.commands import app
 from beers_deploy.model.convbeers import save_network
 from beers_deploy.model.variants import Variant
+from tests.deploy.documents import valid
 from tests.deploy.sealed import SOCKET_CALL
 from tests.model.networks import plain
 from tests.project_files import ROOT
@@ -79,7 +79,7 @@ def test_the_chain_opens_no_socket(
         # The gate ends with 1 for so small a network.
         assert result.exit_code in (0, 1), result.output
     assert Path("run/convbeers-xs.safetensors").is_file()
-    assert json.loads(Path("gate.json").read_text())["command"] == "gate"
+    assert valid(Path("gate.json"))["command"] == "gate"
     assert tifffile.imread("out.tif").shape == (37, 61)
     assert no_sockets == []
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
-import onnx
 import pytest
 
 from beers_deploy.float_onnx import to_onnx
@@ -18,7 +17,7 @@ from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.gate import Spread
 from beers_deploy.quant.onnx.image_input import fixed_tile_px
-from beers_deploy.quant.onnx_file import load_onnx, make_model, save_onnx
+from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session
 from beers_deploy.quantization import steps_of
@@ -28,6 +27,7 @@ from tests.deploy.command_line import done
 from tests.deploy.documents import valid
 from tests.deploy.report.svg import style_of, text_width
 from tests.model.networks import plain
+from tests.quant.simplify.networks import parsed
 
 PHONE_PX = 358
 """The width of a window of 390 pixels without the page's margins."""
@@ -52,11 +52,11 @@ def test_steps_of_fine_tuning_are_whole_or_auto(text: str) -> None:
 def test_the_patch_of_a_network_that_enlarges_is_shown_at_the_result_s_size() -> None:
     """The picture shows the patch next to both results, which may have more pixels."""
     image = np.random.default_rng(0).random((1, 1, 9, 7), np.float32)
-    graph = onnx.parser.parse_graph(
-        "enlarge (float[1, 1, H, W] x) => (float[1, 1, H2, W2] y) <float[4] s = {1, 1, 2, 2}> "
-        '{ y = Resize <mode = "nearest"> (x, , s) }'
+    ends = "float[1,1,H,W] x => float[1,1,P,Q] y"
+    sizes = [1.0, 1.0, 2.0, 2.0]
+    session = open_session(
+        parsed('y = Resize<mode="nearest">(x, , s)', ends, constants={"s": sizes})
     )
-    session = open_session(make_model(graph, {}))
     picture = worst_picture(0, Patches([], [image]), (session, session), 1.0)
     assert picture.caption.startswith("MAE 0.00 DN, at most 0 DN")
 
@@ -109,7 +109,7 @@ def test_quantize_reports_layers(tmp_path: Path) -> None:
     for path in (tmp_path / "i.onnx", tmp_path / "core.onnx"):
         names = {node.name for node in load_onnx(path).graph.node}
         assert set(data["results"]) <= names
-    assert json.loads((tmp_path / "r" / "report.json").read_text())["rows"] == document["rows"]
+    assert valid(tmp_path / "r" / "report.json")["rows"] == document["rows"]
     page = (tmp_path / "r" / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 4
     assert page.count("data:image/svg+xml;base64,") == 1
@@ -180,7 +180,7 @@ def test_a_report_on_samples_shows_the_worst_of_them(tmp_path: Path) -> None:
     np.save(tmp_path / "s.npy", np.random.default_rng(0).random((8, 1, 40, 48), np.float32))
     options = f"--samples {tmp_path}/s.npy --out {tmp_path}/i.onnx --report {tmp_path}/r"
     output = " ".join(done(f"quantize {tmp_path}/f.onnx {options}").split())
-    document = json.loads((tmp_path / "r" / "report.json").read_text())
+    document = valid(tmp_path / "r" / "report.json")
     # Samples without references have no PSNR.
     *_, losses = document["notes"]
     assert "dB" not in losses

@@ -18,6 +18,7 @@ from beers_deploy.profiles.figures import Bound, Check, Row, measured
 from beers_deploy.results import Input, Table
 from beers_deploy.verdict import Baseline, junit_text, read_baseline
 from tests.deploy.command_line import done, refused
+from tests.deploy.documents import valid
 
 ASKED: dict[str, Any] = {"sensor": "pleiades-degraded", "images": None, "patches": 2, "seed": 0}
 
@@ -149,7 +150,7 @@ def test_a_baseline_limits_the_mae(scenes: Path, tmp_path: Path) -> None:
     output = " ".join(done(f"{command} --baseline {first} --json {second}", code=1).split())
     verdict = output.rpartition("gate FAILED, ")[2]
     assert f"MAE against the baseline {before:.4g} of full scale" in verdict
-    content = json.loads(second.read_text())
+    content = valid(second)
     assert content["verdict"] == "failed"
     limits = {check["name"]: (check["value"], check["limit"]) for check in content["checks"]}
     assert limits["MAE against the baseline"] == (before, pytest.approx(1.05 * before / 2))

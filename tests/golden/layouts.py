@@ -45,17 +45,21 @@ CREATION: dict[str, dict[str, object]] = {
 """Creation options of GDAL by layout."""
 
 
-def scene() -> np.ndarray:
-    """Return pixels (48, 70) of 12 bits: texture, an edge, and noise."""
-    rows, columns = np.mgrid[:HEIGHT_PX, :WIDTH_PX] / 20
-    even = 900 + 700 * np.sin(5 * rows) * np.cos(3 * columns) + 1400 * (rows + columns > 3)
-    noise = 12 * np.random.default_rng(0).standard_normal(even.shape)
-    return np.asarray(np.rint((even + noise).clip(0, 4095)).astype(np.uint16))
+def ground(height_px: int, width_px: int, edge: int) -> np.ndarray:
+    """Return digital numbers of texture, an edge, and noise."""
+    rows, columns = np.mgrid[:height_px, :width_px] / 20
+    even = 900 + 700 * np.sin(5 * rows) * np.cos(3 * columns) + 1400 * (rows + columns > edge)
+    return np.asarray(even + 12 * np.random.default_rng(0).standard_normal(even.shape))
+
+
+def digitised(pixels: np.ndarray) -> np.ndarray:
+    """Return digital numbers as uint16 of 12 bits."""
+    return np.asarray(np.rint(pixels.clip(0, 4095)).astype(np.uint16))
 
 
 def bands_of(name: str) -> list[np.ndarray]:
     """Return the planes of a layout: the scene, and the property that the layout tests."""
-    image = scene()
+    image = digitised(ground(HEIGHT_PX, WIDTH_PX, 3))
     if name in ("nodata", "float with nan"):
         image = image.astype(np.float32) if name == "float with nan" else image
         image[20:23, 30:41] = np.nan if name == "float with nan" else NODATA

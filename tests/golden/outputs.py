@@ -31,7 +31,7 @@ from beers_deploy.model.shipped import shipped_names
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.onnx_file import save_onnx
 from benchmarks.small_networks import NETWORKS
-from tests.golden.layouts import CREATION, restored
+from tests.golden.layouts import CREATION, digitised, ground, restored
 from tests.golden.small_networks import quantized
 from tests.golden.wrong_calls import CALLS, answer, inputs
 
@@ -123,12 +123,10 @@ def _answers(folder: Path) -> dict[str, Any]:
 
 def _images(folder: Path) -> dict[str, Path]:
     """Write a textured image of 12 bits, and one of floats with a hole."""
-    rows, columns = np.mgrid[:61, :83] / 20
-    scene = 900 + 700 * np.sin(5 * rows) * np.cos(3 * columns) + 1400 * (rows + columns > 4)
-    noisy = scene + 12 * np.random.default_rng(0).standard_normal(scene.shape)
+    noisy = ground(61, 83, 4)
     holed = noisy.astype(np.float32)[:48, :70]
     holed[20:23, 30:41] = np.nan
-    images = {"uint16": np.rint(noisy.clip(0, 4095)).astype(np.uint16), "float32": holed}
+    images = {"uint16": digitised(noisy), "float32": holed}
     for name, pixels in images.items():
         tifffile.imwrite(folder / f"{name}.tif", pixels)
     return {name: folder / f"{name}.tif" for name in images}

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import onnx
 import tifffile
-from onnx import TensorProto, helper
 from typer.testing import CliRunner
 
 from beers_deploy.cli.commands import app
+from tests.quant.simplify.networks import parsed
 
 CALLS = (
     "restore",
@@ -74,15 +74,12 @@ def inputs(folder: Path) -> None:
 
 def pixelwise() -> onnx.ModelProto:
     """Return a network of one convolution of 1 x 1."""
-    sides: list[str | int] = ["batch", 1, "height", "width"]
-    values = (
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, sides) for name in ("image", "out")
+    sides = "[batch,1,height,width]"
+    return parsed(
+        "[scale] out = Conv(image, weight)",
+        f"float{sides} image => float{sides} out",
+        constants={"weight": [[[[0.9]]]]},
     )
-    image, out = values
-    weight = helper.make_tensor("weight", TensorProto.FLOAT, [1, 1, 1, 1], [0.9])
-    node = helper.make_node("Conv", ["image", "weight"], ["out"], name="scale")
-    graph = helper.make_graph([node], "pixelwise", [image], [out], [weight])
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
 
 
 def answer(words: str) -> dict[str, object]:

@@ -1,29 +1,25 @@
 """Nodes in any order are read as if they were sorted, and cycles are refused."""
 
-import numpy as np
 import onnx
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.onnx.image_input import image_info
 from beers_deploy.quant.onnx.node_order import sort_nodes
-from beers_deploy.quant.onnx_file import GraphWriter, make_model, parse_onnx
+from beers_deploy.quant.onnx_file import parse_onnx
 from tests.quant.quick import assert_same, copied, image
+from tests.quant.simplify.networks import parsed
 
 
 def network() -> onnx.ModelProto:
     """Build a chain of eight nodes that read the image again."""
-    w = GraphWriter()
-    last = "image"
-    for number in range(4):
-        factor = w.constant(f"factor{number}", np.array(number + 0.5, np.float32))
-        scaled = w.node("Mul", f"scaled{number}", [last, factor])
-        last = w.node("Add", f"sum{number}", [scaled, "image"])
-    return make_model(
-        w.graph("chain", [image_info("image", 1, None)], [image_info(last, 1, None)]), {}
-    )
+    nodes = """
+        a = Mul(image, half) b = Add(a, image) c = Mul(b, half) d = Add(c, image)
+        e = Mul(d, half) f = Add(e, image) g = Mul(f, half) last = Add(g, image)
+    """
+    ends = "float[N,1,H,W] image => float[N,1,H,W] last"
+    return parsed(nodes, ends, constants={"half": 0.5})
 
 
 @given(st.permutations(range(8)))

@@ -12,21 +12,21 @@ import onnxruntime as ort
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from beers_deploy.dpu.board import load_dpu
-from beers_deploy.dpu.checker.placement import place
-from beers_deploy.dpu.reading import network_of, read_network
+from beers_deploy.dpu.reading import network_of
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import load_onnx, parse_onnx
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from beers_deploy.quant.untrusted import FILE_BYTES
-from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
+from tests.deploy.dpu.draws import placed
+from tests.deploy.dpu.graphs import board_convbeers, float_convbeers, integer_convbeers
 from tests.project_files import ROOT
 from tests.quant.quick import fix_sizes
 from tests.quant.simplify.networks import parsed
 
 Change = Callable[[onnx.ModelProto], object]
 IMAGE = np.full((1, 1, 12, 14), 0.25, np.float32)
+ENDS = "float[N,1,H,W] image => float[N,1,P,Q] y"
 
 
 @pytest.fixture
@@ -242,17 +242,14 @@ def test_every_truncation_of_a_file_is_refused_or_valid(model: onnx.ModelProto) 
     assert refused >= len(content) // 37 - 5
 
 
-def test_a_network_that_fails_on_an_image_raises_one_sentence(tmp_path: Path) -> None:
-    sketch = Sketch(1)
-    sketch.node("Add", "image", sketch.constant(np.zeros((1, 1, 5, 5), np.float32)))
-    other = sketch.save(tmp_path / "a.onnx", "add0")
-    sketch = Sketch(1)
-    smaller = sketch.save(
-        tmp_path / "b.onnx", sketch.node("MaxPool", "image", kernel_shape=[2, 2], strides=[2, 2])
-    )
-    for path in (other, smaller):
-        with pytest.raises(ModelError, match="its own size"):
-            run(open_session(path, 1), IMAGE)
+@pytest.mark.parametrize(
+    "nodes",
+    ["y = Add(image, five)", "y = MaxPool<kernel_shape=[2,2], strides=[2,2]>(image)"],
+)
+def test_a_network_that_fails_on_an_image_raises_one_sentence(nodes: str) -> None:
+    model = parsed(nodes, ENDS, constants={"five": np.zeros((1, 1, 5, 5))})
+    with pytest.raises(ModelError, match="its own size"):
+        run(open_session(model, 1), IMAGE)
 
 
 def test_weights_without_a_shape_are_refused_in_one_sentence(tmp_path: Path) -> None:
@@ -266,17 +263,12 @@ def test_weights_without_a_shape_are_refused_in_one_sentence(tmp_path: Path) -> 
         open_session(parse_onnx(model.SerializeToString(), "flat.onnx"), 1)
 
 
-def test_a_long_chain_of_activations_is_followed_quickly(tmp_path: Path) -> None:
+def test_a_long_chain_of_activations_is_followed_quickly() -> None:
     """It once ended in a RecursionError: each Relu searched for a QuantizeLinear behind it."""
-    sketch = Sketch(1)
-    scale = sketch.constant(np.array(0.5, np.float32))
-    zero = sketch.constant(np.array(0, np.int8))
-    last = sketch.node(
-        "DequantizeLinear", sketch.node("QuantizeLinear", "image", scale, zero), scale, zero
-    )
-    for _ in range(1200):
-        last = sketch.node("Relu", last)
-    place(read_network(sketch.save(tmp_path / "long.onnx", last), 32), load_dpu("vck190"))
+    relus = " ".join(f"r{k + 1} = Relu(r{k})" for k in range(1200))
+    nodes = f"q = QuantizeLinear(image, half, zero) r0 = DequantizeLinear(q, half, zero) {relus}"
+    constants = {"half": 0.5, "zero": np.int8(0)}
+    placed(parsed(f"{nodes} y = Relu(r1200)", ENDS, constants=constants), 32)
 
 
 def test_onnx_files_are_opened_in_few_places() -> None:

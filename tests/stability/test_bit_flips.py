@@ -1,6 +1,5 @@
 """Tests of bit flips: the loss by injections, the gain by guards, and their cost on the board."""
 
-import json
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -40,6 +39,7 @@ from beers_deploy.studies.stress.faults import (
 from beers_deploy.studies.stress.networks import Subject, open_subject
 from docs.make import bit_flips as maker
 from tests.deploy.command_line import done, refused
+from tests.deploy.documents import valid
 from tests.shipped import shipped_pair
 
 pytestmark = pytest.mark.slow
@@ -139,7 +139,7 @@ def test_the_command(pair: list[Path], tmp_path: Path) -> None:
     files = ["--json", str(tmp_path / "f.json"), "--out", str(tmp_path / "f.md")]
     few = ["--bit-flips", "--draws", "1", "--side", "32"]
     done("stress", *pair, *few, *files)
-    document = json.loads((tmp_path / "f.json").read_text(encoding="utf-8"))
+    document = valid(tmp_path / "f.json")
     assert {row["table"] for row in document["rows"]} == {"bit flips", "guards"}
     page = (tmp_path / "f.md").read_text(encoding="utf-8")
     assert "## What guards cost on the board" in page

@@ -45,6 +45,11 @@ KINDS = {
 }
 
 
+def planes(seed: int = 0, light: float = 1.0) -> np.ndarray:
+    """Return the planes of a noise image, as a core reads them."""
+    return IMAGE_SLICES.encode(np.float32(light) * image(seed=seed))
+
+
 def count_flips(a: np.ndarray, b: np.ndarray, bits: int) -> int:
     difference = (a.astype(np.int64) ^ b.astype(np.int64)) & ((1 << bits) - 1)
     return sum(int(value).bit_count() for value in difference.ravel())
@@ -86,9 +91,8 @@ def test_the_stored_bias_is_int8_and_the_network_the_same(quantized: Quantized) 
     assert weight_bits(stored) == 8 * sum(
         op.weight.size + op.bias.size for op in stored.convolutions
     )
-    planes = IMAGE_SLICES.encode(image())
-    before = run_core(quantized.core, planes)[0]
-    after = run_core(stored, planes)[0]
+    before = run_core(quantized.core, planes())[0]
+    after = run_core(stored, planes())[0]
     for name in before:
         assert_array_equal(before[name], after[name])
 
@@ -125,7 +129,7 @@ def test_numbers_that_the_board_could_not_store_are_refused(quantized: Quantized
 
 
 def test_maps_have_the_channels_that_run(quantized: Quantized) -> None:
-    tensors, _ = run_core(quantized.core, IMAGE_SLICES.encode(image()))
+    tensors, _ = run_core(quantized.core, planes())
     assert {name: tensor.shape[1] for name, tensor in tensors.items()} == map_channels(
         quantized.core
     )
@@ -133,14 +137,13 @@ def test_maps_have_the_channels_that_run(quantized: Quantized) -> None:
 
 @pytest.fixture(scope="module")
 def guards(core: IntCore) -> Guards:
-    return learn_guards(core, [IMAGE_SLICES.encode(image(seed=seed)) for seed in range(3)])
+    return learn_guards(core, [planes(seed) for seed in range(3)])
 
 
 def test_calibration_patches_pass_untouched(core: IntCore, guards: Guards) -> None:
     for seed in range(3):
         bare, clamped = (
-            run_core(core, IMAGE_SLICES.encode(image(seed=seed)), faults=f)[0]
-            for f in (SOUND, guarded(SOUND, guards))
+            run_core(core, planes(seed), faults=f)[0] for f in (SOUND, guarded(SOUND, guards))
         )
         assert_array_equal(bare[CORRECTION], clamped[CORRECTION])
         correction = merged_correction(core, bare)
@@ -149,9 +152,9 @@ def test_calibration_patches_pass_untouched(core: IntCore, guards: Guards) -> No
 
 def test_guards_take_the_smallest_bound_above_the_calibration_peak(core: IntCore) -> None:
     """Dark images stay below 96 units. Bright ones fill int8, and such a ReLU gets no bound."""
-    dark = [IMAGE_SLICES.encode(0.1 * image(seed=seed)) for seed in range(2)]
+    dark = [planes(seed, 0.1) for seed in range(2)]
     guards = learn_guards(core, dark)
-    runs = [run_core(core, planes)[0] for planes in dark]
+    runs = [run_core(core, each)[0] for each in dark]
     assert guards.relu6
     for name, bound in guards.relu6.items():
         peak = max(int(run[name].max()) for run in runs)
@@ -167,8 +170,7 @@ def test_a_clamped_result_keeps_its_bound_whatever_the_weights(core: IntCore) ->
     )
     injected = flip_weights(core, 2000, np.random.default_rng(0))
     bare, clamped = (
-        run_core(injected, IMAGE_SLICES.encode(image(seed=9)), faults=f)[0]
-        for f in (SOUND, guarded(SOUND, some))
+        run_core(injected, planes(9), faults=f)[0] for f in (SOUND, guarded(SOUND, some))
     )
     assert max(int(bare[name].max()) for name in some.relu6) > 24
     assert max(int(clamped[name].max()) for name in some.relu6) == 24
@@ -182,9 +184,7 @@ def test_faults_enter_memory_after_the_clamp(core: IntCore) -> None:
     faults = Faults(
         {}, lambda target, tensor: np.full_like(tensor, 127) if target == name else tensor
     )
-    tensors, _ = run_core(
-        core, IMAGE_SLICES.encode(image()), faults=guarded(faults, Guards({name: 3}, 1.0, {}))
-    )
+    tensors, _ = run_core(core, planes(), faults=guarded(faults, Guards({name: 3}, 1.0, {})))
     assert (tensors[name] == 127).all()
 
 
@@ -212,13 +212,13 @@ def test_voting_takes_the_majority_of_three_copies(core: IntCore) -> None:
 
 def test_a_wrong_shift_is_used(core: IntCore) -> None:
     shifts = shifts_of(core)
-    planes = IMAGE_SLICES.encode(image(seed=2))
-    faultless = run_core(core, planes)[0][CORRECTION]
-    assert_array_equal(run_core(core, planes, faults=Faults(shifts))[0][CORRECTION], faultless)
+    read = planes(2)
+    faultless = run_core(core, read)[0][CORRECTION]
+    assert_array_equal(run_core(core, read, faults=Faults(shifts))[0][CORRECTION], faultless)
     for key in (key for key in shifts if key[1] == "shift_cut"):
         for wrong in (-32, 31):
             assert not np.array_equal(
-                run_core(core, planes, faults=Faults({key: wrong}))[0][CORRECTION], faultless
+                run_core(core, read, faults=Faults({key: wrong}))[0][CORRECTION], faultless
             )
 
 

@@ -1,6 +1,5 @@
 """Tests that `restore --dry-run` shows what `restore` would do, without restoring a pixel."""
 
-import json
 import math
 import sys
 from pathlib import Path
@@ -19,6 +18,7 @@ from beers_deploy.restoration.prepare import NetworkPipeline
 from beers_deploy.restoration.radiometry import Reading
 from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import done
+from tests.deploy.documents import valid
 from tests.shipped import shipped_pair
 
 TAGS = [
@@ -96,9 +96,9 @@ def test_it_reads_none_of_a_file_of_ten_gigabytes(model: Path, tmp_path: Path) -
     del image
     out = tmp_path / "a.json"
     done(f"restore {tmp_path}/big.tif --dry-run --network {model} --json {out}")
-    (row,) = json.loads(out.read_text())["rows"]
+    (row,) = valid(out)["rows"]
     assert row["figures"]["width"]["value"] == 73_000
-    assert [entry["name"] for entry in json.loads(out.read_text())["inputs"]] == [model.name]
+    assert [entry["name"] for entry in valid(out)["inputs"]] == [model.name]
 
 
 @pytest.mark.parametrize("name", ["old.tif", "out.png"])

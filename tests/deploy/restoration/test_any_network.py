@@ -12,7 +12,6 @@ import numpy as np
 import onnx
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from onnx import helper, numpy_helper
 
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
@@ -21,14 +20,15 @@ from beers_deploy.quant.tiling.receptive_field import Tiling, tiling_of
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import PLANES, marked, restored, stopped_after
+from tests.quant.quick import fix_sizes
 from tests.quant.tiling.small_networks import (
     espcn,
     ffdnet,
     float_unet,
     four_bands,
-    graph,
     half_resolution,
     int8_half_resolution,
+    network,
     plain_int8_unet,
 )
 
@@ -154,20 +154,16 @@ def espcn_of_two_bands() -> onnx.ModelProto:
     return model
 
 
-def one_node(op_type: str, **attributes: Any) -> onnx.ModelProto:
-    return graph([helper.make_node(op_type, ["image"], ["restored"], name="head", **attributes)])
-
-
 @pytest.mark.parametrize(
     ("make", "error", "sentence"),
     [
         (
-            partial(one_node, "GlobalAveragePool"),
+            lambda: network("[head] restored = GlobalAveragePool(image)", {}),
             ModelError,
             "GlobalAveragePool head reads the whole image",
         ),
         (
-            partial(one_node, "MaxPool", kernel_shape=[2, 2], strides=[2, 2]),
+            lambda: network("restored = MaxPool<kernel_shape=[2,2], strides=[2,2]>(image)", {}),
             ModelError,
             "size of the image or a multiple of it, but it has 1/2",
         ),
@@ -194,16 +190,10 @@ def test_what_cannot_be_restored_is_refused_in_one_sentence(
 
 def test_tiles_of_a_network_that_reads_its_whole_tile_are_independent(tmp_path: Path) -> None:
     """An image of one tile is restored as it is, a larger one only with a halo that is given."""
-    half = numpy_helper.from_array(np.array(0.5, np.float32), "half")
-    nodes = [
-        helper.make_node("GlobalAveragePool", ["image"], ["mean"], name="pool"),
-        helper.make_node("Add", ["image", "mean"], ["sum"], name="add"),
-        helper.make_node("Mul", ["sum", "half"], ["restored"], name="halve"),
-    ]
-    model = graph(nodes, half)
+    nodes = "[pool] mean = GlobalAveragePool(image) sum = Add(image, mean)"
+    model = network(f"{nodes} restored = Mul(sum, half)", {"half": 0.5})
     for value in (*model.graph.input, *model.graph.output):
-        for side in value.type.tensor_type.shape.dim[2:]:
-            side.dim_value = 32
+        fix_sizes(value, 32, 32)
     path = saved(model, tmp_path)
 
     def halved(pixels: np.ndarray) -> np.ndarray:

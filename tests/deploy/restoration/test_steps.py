@@ -1,6 +1,5 @@
 """Tests of the two steps around a network: exact seams, switches, and the change by each step."""
 
-import json
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -22,6 +21,7 @@ from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.restoration.tiles.rows import HeldRows
 from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import done
+from tests.deploy.documents import valid
 from tests.deploy.restoration.runs import PLANES, marked, restored, stopped_after
 from tests.quant.tiling.small_networks import espcn, four_bands
 
@@ -195,7 +195,7 @@ def test_the_command_reports_the_steps(consistency: bool, exposure: bool, tmp_pa
     files = f"restore {tmp_path}/in.tif {out} --json {results}"
     done(f"{files} --network {INT8} --sensor {SENSOR.name}", *words)
     assert_array_equal(tifffile.imread(out), by_array(image(), INT8, **switches))
-    (row,) = json.loads(results.read_text(encoding="utf-8"))["rows"]
+    (row,) = valid(results)["rows"]
     figures = row["figures"]
     assert (CONSISTENCY in figures, BRIGHTENED in figures) == (consistency, exposure)
     assert row["text"]["consistency"] == ("on" if consistency else "off")

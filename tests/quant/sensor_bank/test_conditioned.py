@@ -7,7 +7,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
@@ -39,6 +39,7 @@ from beers_deploy.studies.stress.faults import with_ops
 from tests.model.networks import condition_of
 from tests.quant.quick import assert_within_bounds
 from tests.quant.sensor_bank.test_filters import textured
+from tests.quant.tiling.small_networks import check_tiles
 
 TEXTURE = 0.3 + 0.3 * textured(46, 58, 9)
 """An image that stays within eight units of the quietest sensor, where INT8 ends."""
@@ -297,19 +298,9 @@ def test_biases_of_another_network_are_refused(conditioned: ConditionedCore) -> 
 def test_tiles_give_the_whole_images_result(pair: Pair) -> None:
     """Mirrored borders reach no farther inside than the halo."""
     file = file_of(pair[1], SENSORS[1])
-    image = textured(96, 80, 6)
-    session = open_session(file)
-    tiling = tiling_of(file)
-    at_once = run(session, image)
-    halo = tiling.halo_px
-    assert tiling.alignment_px == pair[0].variant.scale
-    for top, left in ((0, 0), (32, 24), (64, 48)):
-        above = max(top - halo, 0)
-        before = max(left - halo, 0)
-        read = image[..., above : top + 32 + halo, before : left + 32 + halo]
-        tile = run(session, np.ascontiguousarray(read))[..., top - above :, left - before :]
-        expected = at_once[..., top : top + 32, left : left + 32]
-        assert_array_equal(tile[..., :32, :32], expected)
+    alignment_px = tiling_of(file).alignment_px
+    assert alignment_px == pair[0].variant.scale
+    check_tiles(file, textured(96, 80, 6), (32 // alignment_px,))
 
 
 def test_no_image_leaves_the_bounds_that_are_proven(conditioned: ConditionedCore) -> None:

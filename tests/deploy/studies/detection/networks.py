@@ -3,8 +3,10 @@
 from pathlib import Path
 
 import numpy as np
-import onnx.parser
-from onnx import helper, numpy_helper
+import onnx
+from onnx import helper
+
+from tests.quant.simplify.networks import parsed
 
 NAMES = {0: "Storage Tank", 1: "ship"}
 SUPPRESSION = """
@@ -45,25 +47,25 @@ def detector(
     names = [f"output{i}" for i in range(outputs)]
     last = "sum" if cut is None else "suppressed"
     results = "".join(f"{name} = Identity({last})\n" for name in names)
-    model = onnx.parser.parse_model(f"""<ir_version: 8, opset_import: ["": 17]>
-        detector (float[1,{channels},{size_px},{size_px}] images)
-            => ({", ".join(f"float[{sizes}] {name}" for name in names)}) {{
+    nodes = f"""
         mean = GlobalAveragePool(images)
         level = ReduceMean<keepdims=0>(mean)
         nothing = Mul(level, none)
         sum = Add(answer, nothing)
         {"" if cut is None else SUPPRESSION}
-        {results} }}""")
-    constants = {"answer": answer.astype(np.float32), "none": np.zeros(1, np.float32)}
-    if cut is not None:
-        constants |= {
-            "boxes": np.array([[[0, 0, 1, 1]]], np.float32),
-            "scores": np.array([[[0.5]]], np.float32),
-        }
-        constants |= {"cut": np.array(cut, np.float32), "most": np.array([1])}
-    model.graph.initializer.extend(
-        numpy_helper.from_array(value, name) for name, value in constants.items()
-    )
+        {results}
+    """
+    image = f"float[1,{channels},{size_px},{size_px}] images"
+    constants = {
+        "answer": answer,
+        "none": [0.0],
+        "boxes": [[[0.0, 0.0, 1.0, 1.0]]],
+        "scores": [[[0.5]]],
+        "cut": cut,
+        "most": [1],
+    }
+    ends = ", ".join(f"float[{sizes}] {name}" for name in names)
+    model = parsed(nodes, f"{image} => {ends}", constants=constants)
     helper.set_model_props(
         model, {key: str(value) for key, value in metadata.items() if value is not None}
     )
