@@ -12,7 +12,6 @@ import tifffile
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
-from onnx import helper
 
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.quant.core import IntCore
@@ -30,14 +29,14 @@ from beers_deploy.quant.input_range import (
 )
 from beers_deploy.quant.integer.agreement import agreement
 from beers_deploy.quant.integer.reference import run_core
-from beers_deploy.quant.onnx.image_input import image_info
-from beers_deploy.quant.onnx_file import GraphWriter, make_model
 from beers_deploy.quant.price import price_rows
 from beers_deploy.quant.samples.own import read_samples
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session
 from tests.quant.quick import in_float as float_result
 from tests.quant.quick import quickly, run_model
+from tests.quant.simplify.networks import parsed
+from tests.quant.test_odd_networks import SAME
 
 ENDS = st.floats(-300, 300, width=32)
 PAIRS = st.tuples(ENDS, ENDS).filter(lambda ends: ends[1] - ends[0] > 0.01)
@@ -63,7 +62,6 @@ def network(
     The first one's weights are multiplied by `gains` (C,), the last one's by `out_gains`.
     """
     generator = np.random.default_rng(0)
-    w = GraphWriter()
     pixels = block**2
     factors = np.repeat(np.broadcast_to(gains, channels), pixels)
     first = generator.normal(0, 0.3, (6, channels * pixels, 3, 3))
@@ -71,27 +69,28 @@ def network(
     last = generator.normal(0, 0.3, (outputs * pixels, 6, 5, 5))
     last *= np.broadcast_to(out_gains, len(last))[:, None, None, None]
     bias = generator.normal(0, 0.3, 6)
-    arrays = {"first": first, "bias": bias, "last": last}
-    for name, value in arrays.items():
-        w.constant(name, value.astype(np.float32))
-    x = "image"
+    low, high = limits or (0.0, 0.0)
+    constants = {"first": first, "bias": bias, "last": last, "low": low, "high": high}
+    source = "image"
+    nodes = ""
     if block > 1:
         # ONNX's own operator has another order of the channels than torch, but of one channel.
-        x = w.node("SpaceToDepth", "places", [x], blocksize=block)
-    x = w.node("Conv", "conv_1", [x, "first", "bias"], pads=[1] * 4)
-    x = w.node("Relu", "relu", [x])
-    x = w.node("Conv", "conv_2", [x, "last"], pads=[2] * 4)
+        nodes += f"places = SpaceToDepth<blocksize={block}>(image) "
+        source = "places"
+    nodes += f"conv_1 = {SAME}({source}, first, bias) relu = Relu(conv_1) "
+    nodes += "conv_2 = Conv<pads=[2,2,2,2]>(relu, last) "
+    result = "conv_2"
     if block > 1:
-        x = w.node("DepthToSpace", "pixels", [x], blocksize=block)
+        nodes += f"pixels = DepthToSpace<blocksize={block}>({result}) "
+        result = "pixels"
     if adds_image:
-        x = w.node("Add", "sum", ["image", x])
+        nodes += f"sum = Add(image, {result}) "
+        result = "sum"
     if limits:
-        ends = [w.constant(f"limit_{k}", np.array(end, np.float32)) for k, end in enumerate(limits)]
-        x = w.node("Clip", "clip", [x, *ends])
-    image = image_info("image", channels, None)
-    result = helper.make_tensor_value_info(x, onnx.TensorProto.FLOAT, ["N", outputs, "h", "w"])
-    graph = w.graph("net", [image], [result])
-    return make_model(graph, {})
+        nodes += f"clip = Clip({result}, low, high)"
+        result = "clip"
+    ends = f"float[N,{channels},H,W] image => float[N,{outputs},P,Q] {result}"
+    return parsed(nodes, ends, constants=constants)
 
 
 def shares(channels: int, rows: int = 13, columns: int = 18, count: int = 3) -> list[np.ndarray]:

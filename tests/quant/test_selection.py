@@ -6,16 +6,11 @@ from dataclasses import fields, replace
 import numpy as np
 import onnx
 import pytest
-import torch
-from torch import Tensor, nn
-from torch.nn import functional
 
 from beers_deploy.quant.passes.selection import ALL, Passes
 from beers_deploy.quant.quantize import quantize_model
-from beers_deploy.quant.simplify.simplify import simplify
-from examples.networks import DPU_SLOPE, to_onnx
 from tests.quant.quick import patches_of, run_model
-from tests.quant.test_odd_networks import VALID
+from tests.quant.test_odd_networks import SAME, VALID, sketch
 
 pytestmark = pytest.mark.slow
 
@@ -30,24 +25,22 @@ def waves(phase: int) -> np.ndarray:
     return np.asarray(image, np.float32)[None, None]
 
 
-class Distilling(nn.Module):
-    """A distillation network of one step: an activation behind a sum, and a long skip."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.head = nn.Conv2d(1, 4, 3, padding=1)
-        self.refine = nn.Conv2d(4, 4, 3, padding=1)
-        self.smooth = nn.Conv2d(4, 4, 3, padding=1)
-        self.tail = nn.Conv2d(4, 1, 3, padding=1)
-        generator = torch.Generator().manual_seed(0)
-        for numbers in self.parameters():
-            nn.init.uniform_(numbers, -0.3, 0.3, generator=generator)
-
-    def forward(self, image: Tensor) -> Tensor:
-        head = self.head(image)
-        refined = functional.leaky_relu(self.refine(head) + head, DPU_SLOPE)
-        correction: Tensor = self.tail(self.smooth(refined) + head)
-        return image + correction
+DISTILLING = sketch(
+    f"""head = {SAME}(in, head_w, head_b)
+    refined = {SAME}(head, refined_w, refined_b)
+    sum = Add(refined, head)
+    active = LeakyRelu<alpha=0.1015625>(sum)
+    smooth = {SAME}(active, smooth_w, smooth_b)
+    deep = Add(smooth, head)
+    tail = {SAME}(deep, tail_w, tail_b)
+    out = Add(in, tail)""",
+    sizes={"tail": 0.1},
+    head=(4, 1, 3, 3),
+    refined=(4, 4, 3, 3),
+    smooth=(4, 4, 3, 3),
+    tail=(1, 4, 3, 3),
+)
+"""A distillation network of one step: an activation behind a sum, and a long skip."""
 
 
 @pytest.fixture(scope="module")
@@ -56,11 +49,10 @@ def results(float_onnx: onnx.ModelProto) -> Results:
 
     One adds to the image, one computes the whole image, and one is a distillation network.
     """
-    distilling = simplify(to_onnx("dncnn", Distilling()), "distilling")
     patches = patches_of([waves(phase) for phase in range(3)])
 
     def of_passes(passes: Passes) -> list[np.ndarray]:
-        networks = (float_onnx, VALID["dead channels"], distilling)
+        networks = (float_onnx, VALID["dead channels"], DISTILLING)
         files = [quantize_model(network, patches, {}, passes=passes).host for network in networks]
         return [run_model(file, waves(0)) for file in files]
 

@@ -17,7 +17,8 @@ from beers_deploy.quant.domains import INTEGER_OPERATORS, is_foreign, operator_n
 from beers_deploy.quant.graph import refusal
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.verbs.check import check
-from tests.deploy.dpu.graphs import Sketch
+from tests.deploy.dpu.graphs import SAME
+from tests.quant.simplify.networks import parsed
 
 BOARDS = [*board_names(), *npu_names()]
 DOMAINS = ["my.ops", "com.microsoft", "com.microsoft.nchwc", "pkg.torch.local"]
@@ -26,19 +27,19 @@ PLACES = ["front", "behind a convolution", "between", "behind a host's node", "e
 
 def network(path: Path, place: str, domain: str) -> Path:
     """Write a network of DPU operators and host parts, with `domain` for the one at `place`."""
-    sketch = Sketch(8)
 
-    def node(position: str, op_type: str, *inputs: str) -> str:
-        return sketch.node(op_type, *inputs, domain=domain if position == place else "")
+    def kind(position: str, op_type: str) -> str:
+        return f"{domain}.{op_type}" if position == place else op_type
 
-    scaled = node("front", "Mul", "image", sketch.constant(np.array(0.5, np.float32)))
-    first = node("behind a convolution", "Relu", sketch.conv(scaled))
-    deep = sketch.conv(node("between", "Add", first, sketch.conv(first)))
-    limits = sketch.constant(np.array(0, np.float32)), sketch.constant(np.array(1, np.float32))
-    back = sketch.node("Clip", deep, *limits)
-    behind = node("behind a host's node", "Mul", back, limits[1])
-    sketch.save(path, node("end", "Clip", behind, *limits))
-    model = onnx.load_model(path)
+    nodes = f"""
+        scaled = {kind("front", "Mul")}(image, half)
+        a = {SAME}(scaled, w) first = {kind("behind a convolution", "Relu")}(a)
+        b = {SAME}(first, w) sum = {kind("between", "Add")}(first, b) deep = {SAME}(sum, w)
+        back = Clip(deep, low, high) behind = {kind("behind a host's node", "Mul")}(back, high)
+        y = {kind("end", "Clip")}(behind, low, high)
+    """
+    constants = {"w": np.zeros((8, 8, 3, 3)), "half": 0.5, "low": 0.0, "high": 1.0}
+    model = parsed(nodes, "float[N,8,H,W] image => float[N,8,H,W] y", constants=constants)
     model.opset_import.append(helper.make_opsetid(domain, 1))
     onnx.save_model(model, path)
     return path

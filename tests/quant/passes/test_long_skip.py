@@ -3,12 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import onnx
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
-from torch import Tensor, nn
 
 from beers_deploy.quant.graph import (
     CORRECTION,
@@ -28,8 +27,9 @@ from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.simplify.simplify import simplify
 from beers_deploy.quant.structure import saturated_shares
-from examples.networks import to_onnx
 from tests.quant.quick import patches_of, random_conv, run_model, waves
+from tests.quant.simplify.networks import parsed
+from tests.quant.test_odd_networks import SAME
 
 FEATURES = 5
 
@@ -110,32 +110,28 @@ def test_other_sums_are_left_alone(name: str) -> None:
     assert split_long_skip(graph) is graph
 
 
-class Bright(nn.Module):
-    """A network whose features contain the image, which is far larger than the restored details."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.head = nn.Conv2d(1, 8, 3, padding=1)
-        self.body = nn.Sequential(nn.Conv2d(8, 8, 3, padding=1), nn.ReLU())
-        self.tail = nn.Conv2d(8, 1, 3, padding=1)
-
-    def forward(self, image: Tensor) -> Tensor:
-        head = self.head(image)
-        correction: Tensor = self.tail(self.body(head) + head)
-        return image + 0.02 * correction
+def bright() -> onnx.ModelProto:
+    """Build a network whose features contain the image, which is far larger than the details."""
+    generator = np.random.default_rng(3)
+    first = generator.uniform(-0.1, 0.1, (8, 1, 3, 3))
+    inner = generator.uniform(-0.3, 0.3, (8, 8, 3, 3))
+    last = generator.uniform(-0.3, 0.3, (1, 8, 3, 3))
+    # Each feature is the image with some detail, and the tail cancels the image.
+    first[:, :, 1, 1] += 1
+    last -= last.mean(1, keepdims=True)
+    nodes = f"""
+        head = {SAME}(x, first) inner = {SAME}(head, inner_w) body = Relu(inner)
+        sum = Add(body, head) tail = {SAME}(sum, last) correction = Mul(tail, small)
+        y = Add(x, correction)
+    """
+    constants = {"first": first, "inner_w": inner, "last": last, "small": 0.02}
+    ends = "float[N,1,H,W] x => float[N,1,H,W] y"
+    return simplify(parsed(nodes, ends, constants=constants), "bright")
 
 
 def test_int8_errs_less(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("beers_deploy.quant.quantize.activates_sums", lambda _: True)
-    network = Bright()
-    generator = torch.Generator().manual_seed(3)
-    with torch.no_grad():
-        for numbers in network.parameters():
-            numbers.uniform_(-0.3, 0.3, generator=generator)
-        # Each feature is the image with some detail, and the tail cancels the image.
-        network.head.weight.mul_(0.3)[:, :, 1, 1] += 1
-        network.tail.weight.sub_(network.tail.weight.mean(1, keepdim=True))
-    model = simplify(to_onnx("dncnn", network), "bright")
+    model = bright()
     *images, held_out = (0.1 + 0.8 * each for each in waves(5))
     in_float = run_model(model, held_out)
     split, whole = (
