@@ -1,7 +1,6 @@
 """Test that check, quantize, gate, bench and restore agree on which networks they accept."""
 
 import logging
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,107 +15,61 @@ from onnx import helper
 import beers_deploy as bd
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.quant.input_range import from_shares, to_shares
-from beers_deploy.quant.onnx.image_input import image_info
-from beers_deploy.quant.onnx_file import GraphWriter, make_model
+from tests.deploy.dpu.graphs import SAME
 from tests.quant.quick import fix_sizes, one_guess
+from tests.quant.simplify.networks import parsed
 
-CHANNELS = 4
-GENERATOR = 5
 SAMPLES = np.random.default_rng(1).uniform(0, 1, (8, 1, 32, 32)).astype(np.float32)
-
-
-class Drawn(GraphWriter):
-    """Writes a network of drawn weights."""
-
-    def __init__(self, pad: int) -> None:
-        """Begin a network whose convolutions are padded by `pad` unless they state another
-        number.
-        """
-        super().__init__()
-        self._pad = pad
-        self._generator = np.random.default_rng(GENERATOR)
-
-    def number(self, value: float, *shape: int) -> str:
-        """Write a constant of one value and return its name."""
-        name = f"number_{len(self.nodes)}_{value}"
-        return self.constant(name, np.full(shape, value, np.float32))
-
-    def integers(self, *values: int) -> str:
-        """Write a constant list and return its name."""
-        return self.constant(f"integers_{len(self.nodes)}_{values}", np.array(values))
-
-    def add(self, kind: str, *sources: str, **attributes: Any) -> str:
-        """Write a node and return its result."""
-        return self.node(kind, f"t{len(self.nodes)}", list(sources), **attributes)
-
-    def conv(
-        self, source: str, outputs: int, inputs: int, pad: int | None = None, gain: float = 1
-    ) -> str:
-        """Write a convolution of 3 x 3 with drawn weights and return its result."""
-        pad = self._pad if pad is None else pad
-        weight = gain * self._generator.normal(0, 0.3, (outputs, inputs, 3, 3))
-        name = self.constant(f"w{len(self.nodes)}", weight.astype(np.float32))
-        return self.add("Conv", source, name, pads=[pad] * 4)
-
-    def save(self, path: Path, *results: str) -> Path:
-        """Write the network with these results of one channel to a file."""
-        infos = [
-            helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["N", 1, None, None])
-            for name in results
-        ]
-        graph = self.graph("drawn", [image_info("image", 1, None)], infos)
-        onnx.save(make_model(graph, {}), path)
-        return path
-
-
-Part = Callable[[Drawn, str], str]
-"""Writes operations behind a map of `CHANNELS` channels, and returns another such map."""
-
-
-def split_gate(w: Drawn, source: str) -> str:
-    """Write NAFNet's gate."""
-    wide = w.conv(source, 2 * CHANNELS, CHANNELS)
-    names = [f"{wide}.a", f"{wide}.b"]
-    node = helper.make_node("Split", [wide], names, f"{wide}.split", axis=1)
-    w.nodes.append(node)
-    return w.add("Mul", *names)
-
-
-def hard_swish(w: Drawn, source: str) -> str:
-    """Write HardSwish as exporters spell it out."""
-    clipped = w.add("Clip", w.add("Add", source, w.number(3)), w.number(0), w.number(6))
-    return w.add("Mul", source, w.add("Div", clipped, w.number(6)))
-
-
-PARTS: dict[str, Part] = {
-    "convolution": lambda w, x: w.conv(x, CHANNELS, CHANNELS),
-    "valid": lambda w, x: w.conv(x, CHANNELS, CHANNELS, pad=0),
-    "large kernel": lambda w, x: w.add(
-        "Conv", x, w.number(0.01, CHANNELS, CHANNELS, 9, 9), pads=[4] * 4
-    ),
-    "crop": lambda w, x: w.add("Slice", x, *(w.integers(k, k) for k in (2, -2)), w.integers(2, 3)),
-    "relu": lambda w, x: w.add("Relu", x),
-    "one-sided clip": lambda w, x: w.add("Clip", x, w.number(0)),
-    "larger of two": lambda w, x: w.add("Max", x, w.number(0)),
-    "hard-swish": hard_swish,
-    "split gate": split_gate,
-    "less itself": lambda w, x: w.add("Sub", w.conv(x, CHANNELS, CHANNELS), x),
-    "over a constant": lambda w, x: w.add("Div", x, w.number(2, CHANNELS, 1, 1)),
-    "down and up": lambda w, x: w.add(
-        "Resize",
-        w.add("MaxPool", x, kernel_shape=[2, 2], strides=[2, 2]),
-        "",
-        w.constant("twice", np.array([1, 1, 2, 2], np.float32)),
-        mode="nearest",
-        coordinate_transformation_mode="asymmetric",
-        nearest_mode="floor",
-    ),
-    "one channel": lambda w, x: w.add("Mul", x, w.conv(x, 1, CHANNELS, pad=1)),
-    "leaky": lambda w, x: w.add("LeakyRelu", x, alpha=0.3),
-    "hard sigmoid": lambda w, x: w.add("HardSigmoid", x, alpha=0.2),
-    "mean over channels": lambda w, x: w.add("Sub", x, w.add("ReduceMean", x, axes=[1])),
-    "sine": lambda w, x: w.add("Sin", x),
+GENERATOR = np.random.default_rng(5)
+SHAPES = {
+    "first": (4, 1, 3, 3),
+    "second": (4, 1, 3, 3),
+    "w": (4, 4, 3, 3),
+    "wide": (8, 4, 3, 3),
+    "four": (4, 4, 3, 3),
+    "one": (1, 4, 3, 3),
+    "one_of_eight": (1, 8, 3, 3),
 }
+CONSTANTS: dict[str, Any] = {
+    **{name: GENERATOR.normal(0, 0.3, shape) for name, shape in SHAPES.items()},
+    "broad": np.full((4, 4, 9, 9), 0.01),
+    "halves": np.full((4, 1, 1), 2.0),
+    "zero": 0.0,
+    "three": 3.0,
+    "six": 6.0,
+    "twos": [2, 2],
+    "minus_twos": [-2, -2],
+    "sides": [2, 3],
+    "double": [1.0, 1.0, 2.0, 2.0],
+}
+ENDS = "float[N,1,H,W] image => float[N,1,P,Q] y"
+TWO = f"a = {SAME}(image, first) b = {SAME}(image, second)"
+BLOCKS = 'coordinate_transformation_mode="asymmetric", nearest_mode="floor"'
+PARTS = {
+    "convolution": "{y} = {conv}({x}, w)",
+    "valid": "{y} = Conv({x}, w)",
+    "large kernel": "{y} = Conv<pads=[4,4,4,4]>({x}, broad)",
+    "crop": "{y} = Slice({x}, twos, minus_twos, sides)",
+    "relu": "{y} = Relu({x})",
+    "one-sided clip": "{y} = Clip({x}, zero)",
+    "larger of two": "{y} = Max({x}, zero)",
+    # As exporters spell it out.
+    "hard-swish": """{y}a = Add({x}, three) {y}b = Clip({y}a, zero, six) {y}c = Div({y}b, six)
+        {y} = Mul({x}, {y}c)""",
+    # NAFNet's gate.
+    "split gate": """{y}a = {conv}({x}, wide) {y}b, {y}c = Split<axis=1>({y}a)
+        {y} = Mul({y}b, {y}c)""",
+    "less itself": "{y}a = {conv}({x}, w) {y} = Sub({y}a, {x})",
+    "over a constant": "{y} = Div({x}, halves)",
+    "down and up": """{y}a = MaxPool<kernel_shape=[2,2], strides=[2,2]>({x})
+        {y} = Resize<{blocks}>({y}a, , double)""",
+    "one channel": "{y}a = Conv<pads=[1,1,1,1]>({x}, one) {y} = Mul({x}, {y}a)",
+    "leaky": "{y} = LeakyRelu<alpha=0.3>({x})",
+    "hard sigmoid": "{y} = HardSigmoid<alpha=0.2>({x})",
+    "mean over channels": "{y}a = ReduceMean<axes=[1]>({x}) {y} = Sub({x}, {y}a)",
+    "sine": "{y} = Sin({x})",
+}
+"""Operations from a map `x` of four channels to another one, `y`, in ONNX's text format."""
 
 
 RANGES = [(0.0, 1.0), (-1.0, 1.0), (0.0, 255.0), (-2.1, 2.6)]
@@ -137,26 +90,38 @@ def drawn(
 
     It may have an output of twice the sampling too, and an activation of the image.
     """
-    w = Drawn(int(padded))
-    size = ends[1] - ends[0]
-    first = w.add("Relu", "image") if is_active else "image"
-    last = w.conv(first, CHANNELS, 1, gain=1 / size)
-    for part in parts:
-        last = PARTS[part](w, last)
-    large = w.conv(last, 4, CHANNELS, gain=size)
-    last = w.conv(last, 1, CHANNELS, gain=size)
+    conv = f"Conv<pads={[int(padded)] * 4}>"
+    source = "active" if is_active else "image"
+    nodes = ["active = Relu(image)"] if is_active else []
+    nodes.append(f"x0 = {conv}({source}, first)")
+    for number, part in enumerate(parts):
+        names = {"x": f"x{number}", "y": f"x{number + 1}"}
+        nodes.append(PARTS[part].format(**names, conv=conv, blocks=BLOCKS))
+    nodes.append(f"pixels = {conv}(x{len(parts)}, four) result = {conv}(x{len(parts)}, one)")
+    result = "result"
     # Without padding the result has another size than the image.
     if adds_image and padded:
-        last = w.add("Add", "image", last)
+        nodes.append(f"sum = Add(image, {result})")
+        result = "sum"
     if clips:
-        last = w.add("Clip", last, *map(w.number, ends))
-    names = [w.node("Identity", "restored", [last])]
+        nodes.append(f"clipped = Clip({result}, low, high)")
+        result = "clipped"
+    nodes.append(f"restored = Identity({result})")
+    outputs = "float[N,1,P,Q] restored"
     if has_two:
-        names.append(w.node("DepthToSpace", "large", [large], blocksize=2))
-    return w.save(path, *names)
+        nodes.append("large = DepthToSpace<blocksize=2>(pixels)")
+        outputs += ", float[N,1,R,S] large"
+    size = ends[1] - ends[0]
+    constants = {**CONSTANTS, "first": CONSTANTS["first"] / size, "low": ends[0], "high": ends[1]}
+    constants |= {name: size * CONSTANTS[name] for name in ("four", "one")}
+    model = parsed(" ".join(nodes), f"float[N,1,H,W] image => {outputs}", constants=constants)
+    onnx.save(model, path)
+    return path
 
 
-def quickly(network: Path, samples: np.ndarray = SAMPLES, **options: Any) -> bd.Network:
+def quickly(
+    network: Path | onnx.ModelProto, samples: np.ndarray = SAMPLES, **options: Any
+) -> bd.Network:
     """Quantise a network without a search."""
     with one_guess():
         return bd.quantize(network, samples=samples, progress=False, **options)
@@ -211,12 +176,10 @@ def test_commands_do_not_contradict_each_other(
     np.testing.assert_allclose(restored, expected, atol=0.01)
 
 
-def fixed(path: Path, side_px: int) -> Path:
-    """Write the network of a file again, fixed to images of a size."""
-    model = onnx.load(path)
+def fixed(model: onnx.ModelProto, side_px: int) -> onnx.ModelProto:
+    """Return a network that is fixed to images of a size."""
     fix_sizes(model.graph.input[0], side_px, side_px)
-    onnx.save(onnx.shape_inference.infer_shapes(model), path.with_name("fixed.onnx"))
-    return path.with_name("fixed.onnx")
+    return onnx.shape_inference.infer_shapes(model)
 
 
 def test_unpadded_networks_of_a_fixed_size_get_one_answer(tmp_path: Path) -> None:
@@ -224,16 +187,16 @@ def test_unpadded_networks_of_a_fixed_size_get_one_answer(tmp_path: Path) -> Non
     path = drawn(
         tmp_path / "a.onnx", ["relu", "valid"], adds_image=False, clips=False, padded=False
     )
-    path = fixed(path, 32)
-    assert bd.check(path)
-    int8 = quickly(path)
+    model = fixed(onnx.load(path), 32)
+    assert bd.check(model)
+    int8 = quickly(model)
     assert int8.table is not None
     assert not any("`restore`" in note for note in int8.table.notes)
     assert int8(SAMPLES[:1]).shape == SAMPLES[:1].shape
-    assert bd.gate(path, int8, samples=SAMPLES, max_mae=0.1, progress=False)
+    assert bd.gate(model, int8, samples=SAMPLES, max_mae=0.1, progress=False)
     how: dict[str, Any] = {"full_scale": 1, "progress": False, "force": True, "tile": 32}
     image = np.tile(SAMPLES[0, 0], (2, 2))
-    for network in (path, int8):
+    for network in (model, int8):
         swath = bd.bench(network, tile=32, traditional=False)
         assert not any("whole images" in note for note in swath.notes)
         assert bd.restore(image, network=network, **how).shape == image.shape
@@ -274,14 +237,13 @@ def test_an_input_that_is_no_image_has_one_remedy(
             command()
 
 
-def test_quantize_notes_that_restore_leaves_seams(tmp_path: Path) -> None:
+def test_quantize_notes_that_restore_leaves_seams() -> None:
     """A network that pools over its whole image has integers, and independent tiles alone."""
-    w = Drawn(1)
-    first = w.conv("image", CHANNELS, 1)
-    gate = w.add("HardSigmoid", w.conv(w.add("GlobalAveragePool", first), CHANNELS, CHANNELS))
-    w.nodes[-1].attribute.append(helper.make_attribute("alpha", 1 / 6))
-    last = w.conv(w.add("Mul", first, gate), 1, CHANNELS)
-    int8 = quickly(fixed(w.save(tmp_path / "a.onnx", last), 32))
+    nodes = f"""
+        a = {SAME}(image, first) mean = GlobalAveragePool(a) b = {SAME}(mean, w)
+        gate = HardSigmoid<alpha=0.16666667>(b) gated = Mul(a, gate) y = {SAME}(gated, one)
+    """
+    int8 = quickly(fixed(parsed(nodes, ENDS, constants=CONSTANTS), 32))
     assert int8.table is not None
     assert any("restores its tiles independently" in note for note in int8.table.notes)
     restore = partial(bd.restore, network=int8, full_scale=1, tile=32, force=True, progress=False)
@@ -293,34 +255,29 @@ def test_quantize_notes_that_restore_leaves_seams(tmp_path: Path) -> None:
     assert restore(larger, halo="4").shape == larger.shape
 
 
-def test_quantize_warns_of_what_the_board_refuses(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_quantize_warns_of_what_the_board_refuses(caplog: pytest.LogCaptureFixture) -> None:
     """The file is written, because other hardware may run it, but the user is warned."""
-    w = Drawn(1)
-    first, second = (w.conv("image", CHANNELS, 1) for _ in range(2))
-    leaky = w.add("LeakyRelu", w.add("Add", first, second), alpha=26 / 256)
-    path = w.save(tmp_path / "a.onnx", w.conv(leaky, 1, CHANNELS))
+    nodes = f"{TWO} c = Add(a, b) leaky = LeakyRelu<alpha=0.1015625>(c) y = {SAME}(leaky, one)"
+    model = parsed(nodes, ENDS, constants=CONSTANTS)
     board = "zcu102"
     with caplog.at_level(logging.WARNING, "beers_deploy"):
-        int8 = quickly(path, target=board)
+        int8 = quickly(model, target=board)
     (warning,) = caplog.messages
     assert warning.startswith(f"{board} does not run it: check FAILED")
     assert "LeakyRelu stands behind add" in warning
     assert not bd.check(int8, target=board)
 
 
-@pytest.mark.parametrize("kind", ["Add", "Mul", "Concat", "AveragePool"])
-def test_a_network_after_adapt_passes_behind_any_operation(kind: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("operation", "last"),
+    [
+        ("Add(a, b)", "one"),
+        ("Mul(a, b)", "one"),
+        ("Concat<axis=1>(a, b)", "one_of_eight"),
+        ("AveragePool<kernel_shape=[3,3], pads=[1,1,1,1], count_include_pad=1>(a)", "one"),
+    ],
+)
+def test_a_network_after_adapt_passes_behind_any_operation(operation: str, last: str) -> None:
     """`check` advises `--adapt`, so the result of `--adapt` must pass."""
-    w = Drawn(1)
-    feeds = [w.conv("image", CHANNELS, 1) for _ in range(2)]
-    attributes: dict[str, Any] = {"axis": 1} if kind == "Concat" else {}
-    if kind == "AveragePool":
-        feeds = feeds[:1]
-        attributes = {"kernel_shape": [3, 3], "pads": [1, 1, 1, 1], "count_include_pad": 1}
-    source = w.add(kind, *feeds, **attributes)
-    silu = w.add("Mul", source, w.add("Sigmoid", source))
-    last = w.conv(silu, 1, CHANNELS * (2 if kind == "Concat" else 1))
-    path = w.save(tmp_path / "a.onnx", last)
-    assert bd.check(quickly(path, adapt=True))
+    nodes = f"{TWO} c = {operation} s = Sigmoid(c) silu = Mul(c, s) y = {SAME}(silu, {last})"
+    assert bd.check(quickly(parsed(nodes, ENDS, constants=CONSTANTS), adapt=True))
