@@ -1,7 +1,7 @@
 """Tests of a network that reads colours and a map of noise levels, as FFDNet does."""
 
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import onnxruntime as ort
@@ -16,6 +16,7 @@ from beers_deploy.profiles.errors import ImageError, ModelError
 from beers_deploy.quant.encodings import read_core
 from tests.deploy.command_line import done, refused
 from tests.quant.quick import one_guess
+from tests.quant.simplify.networks import parsed
 
 TOP = 50
 """The largest noise level, in digital numbers of 8 bits."""
@@ -134,11 +135,9 @@ def test_image_files_are_samples_of_a_stated_range(tmp_path: Path) -> None:
     So their results are those of the same values as arrays. A range that was only found in samples
     states nothing about full scale, so `gate` refuses image files for it.
     """
-    convolution = nn.Conv2d(3, 3, 3, padding=1)
-    with torch.no_grad():
-        convolution.weight.normal_(0, 0.2, generator=torch.Generator().manual_seed(0))
-        cast(torch.Tensor, convolution.bias).zero_()
-    floating = bd.Network.load(convolution, example=(1, 3, 32, 32))
+    weight = np.random.default_rng(0).normal(0, 0.2, (3, 3, 3, 3))
+    ends = "float[N,3,H,W] x => float[N,3,H,W] y"
+    floating = parsed("y = Conv<pads=[1,1,1,1]>(x, w)", ends, constants={"w": weight})
     pixels = np.random.default_rng(6).integers(0, 256, (4, 32, 32, 3), np.uint8)
     pixels[:, 0, :2] = [[0], [255]]
     for number, image in enumerate(pixels):

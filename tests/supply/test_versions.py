@@ -11,12 +11,14 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 import tifffile
 from packaging.requirements import Requirement
 
-from tests.deploy.dpu.graphs import Sketch
+from tests.deploy.dpu.graphs import SAME
 from tests.project_files import ROOT, text_of
+from tests.quant.simplify.networks import parsed
 
 PROJECT = [
     "deploy",
@@ -94,18 +96,16 @@ def folder(tmp_path: Path) -> Path:
         tmp_path / "samples.npy",
         rng.uniform(0, 1, (SAMPLES, 1, SIDE_PX, SIDE_PX)).astype(np.float32),
     )
-    sketch = Sketch(channels=1)
-    features = sketch.node("Relu", conv(sketch, rng, "image", 8, 1))
-    sketch.save(
-        tmp_path / "float.onnx",
-        sketch.node("Add", "image", conv(sketch, rng, features, 1, 8)),
+    model = parsed(
+        f"a = {SAME}(image, first) b = Relu(a) c = {SAME}(b, last) y = Add(image, c)",
+        "float[N,1,H,W] image => float[N,1,H,W] y",
+        constants={
+            "first": rng.normal(0, 0.1, (8, 1, 3, 3)),
+            "last": rng.normal(0, 0.1, (1, 8, 3, 3)),
+        },
     )
+    onnx.save(model, tmp_path / "float.onnx")
     return tmp_path
-
-
-def conv(sketch: Sketch, rng: np.random.Generator, source: str, outputs: int, inputs: int) -> str:
-    weight = sketch.constant(rng.normal(0, 0.1, (outputs, inputs, 3, 3)).astype(np.float32))
-    return sketch.node("Conv", source, weight, pads=[1] * 4)
 
 
 COMMANDS = """

@@ -10,7 +10,6 @@ import numpy as np
 import onnx
 import pytest
 import tifffile
-from torch import nn
 
 import beers_deploy as bd
 from beers_deploy.dpu.board import boards_of, load_dpu
@@ -27,10 +26,10 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import board_names, npu_names
 from tests.deploy.dpu.graphs import integer_convbeers
 from tests.profiles.own_sensor import departing
-from tests.quant.quick import fix_sizes
+from tests.quant.simplify.networks import parsed
 
 
-def bench(model: Path, target: str = "vck190", **options: Any) -> Bench:
+def bench(model: Path | onnx.ModelProto, target: str = "vck190", **options: Any) -> Bench:
     """Predict a small swath in small tiles; the traditional pipeline is not measured."""
     usual: dict[str, Any] = {"size": "300x260", "tile": 128, "traditional": False}
     return bd.bench(model, target=target, **{**usual, **options})
@@ -47,23 +46,19 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return integer_convbeers(tmp_path_factory.mktemp("net") / "net.onnx", 2, 16)
 
 
-@pytest.fixture(scope="module")
-def classifier(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a classifier of images of 32 x 32 pixels into ten classes."""
-    path = tmp_path_factory.mktemp("net") / "classifier.onnx"
-    features = nn.Sequential(
-        nn.Conv2d(1, 16, 3, stride=2, padding=1),
-        nn.ReLU(),
-        nn.Conv2d(16, 16, 3, stride=2, padding=1, groups=16),
-        nn.ReLU6(),
-        nn.Conv2d(16, 64, 1),
-        nn.ReLU6(),
-    )
-    network = nn.Sequential(features, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(64, 10))
-    model = bd.Network.load(network, example=(1, 1, 32, 32)).model
-    fix_sizes(model.graph.input[0], 32, 32)
-    onnx.save(model, path)
-    return path
+def classifier() -> onnx.ModelProto:
+    """Build a classifier of images of 32 x 32 pixels into ten classes."""
+    half = "pads=[1,1,1,1], strides=[2,2]"
+    nodes = f"""
+        a = Conv<{half}>(image, first) b = Relu(a)
+        c = Conv<{half}, group=16>(b, deep) d = Clip(c, zero, six)
+        e = Conv(d, wide) f = Clip(e, zero, six)
+        mean = GlobalAveragePool(f) line = Flatten(mean) y = Gemm(line, last)
+    """
+    shapes = {"first": (16, 1, 3, 3), "deep": (16, 1, 3, 3), "wide": (64, 16, 1, 1)}
+    weights = {name: np.ones(shape) for name, shape in shapes.items()}
+    constants = {**weights, "last": np.ones((64, 10)), "zero": 0.0, "six": 6.0}
+    return parsed(nodes, "float[1,1,32,32] image => float[1,10] y", constants=constants)
 
 
 def names(rows: Sequence[Row]) -> list[str]:
@@ -131,9 +126,9 @@ def test_the_first_line_warns_if_other_programs_load_the_machine(
     assert ("other programs took 50%" in heading) is warned
 
 
-def test_a_network_that_is_not_tiled_is_predicted_by_the_frame(classifier: Path) -> None:
+def test_a_network_that_is_not_tiled_is_predicted_by_the_frame() -> None:
     # The traditional pipeline restores only swaths, so `traditional` has no effect here.
-    result = bench(classifier, size=None, traditional=True)
+    result = bench(classifier(), size=None, traditional=True)
     (frame,) = [row for row in result.rows if row.table == "frames"]
     assert (frame.figures["throughput"].interval or (0, 0))[0] > 0
     layers = result.layers
@@ -143,7 +138,7 @@ def test_a_network_that_is_not_tiled_is_predicted_by_the_frame(classifier: Path)
     assert not any("traditional" in name for name in names(result.rows))
     with pytest.raises(ModelError, match=r"GlobalAveragePool.*by the frame, leave out `size`\."):
         # A size describes a swath.
-        bench(classifier, size="300x260")
+        bench(classifier(), size="300x260")
 
 
 @pytest.mark.parametrize("target", ["all", "kv260,vck190"])

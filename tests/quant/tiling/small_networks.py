@@ -1,5 +1,6 @@
 """Small networks with strides, pools, transposed convolutions, shuffles, resizes and concats."""
 
+import json
 import math
 from collections.abc import Mapping
 from functools import cache
@@ -9,13 +10,11 @@ import numpy as np
 import onnx
 import torch
 from numpy.typing import ArrayLike
-from onnx import helper, numpy_helper
 
 from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import Variant
-from beers_deploy.quant.onnx.image_input import any_size, image_info
-from beers_deploy.quant.onnx_file import make_model
+from beers_deploy.quant.onnx.image_input import any_size
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.tiling.receptive_field import tiling_of
@@ -42,55 +41,38 @@ def network(
     return model
 
 
-def int64_tensor(*values: int) -> onnx.TensorProto:
-    return numpy_helper.from_array(np.array(values, np.int64))
-
-
-def taps(name: str, *shape: int) -> onnx.TensorProto:
+def taps(name: str, *shape: int) -> np.ndarray:
     """Return weights of small integers, whose sums are exact in float32 in any order."""
     values = np.random.default_rng(list(name.encode())).choice([-2, -1, 1, 2, 3], shape)
-    return numpy_helper.from_array(values.astype(np.float32), name)
-
-
-def float32_tensor(*values: float) -> onnx.TensorProto:
-    """Return a float32 tensor of the values, or a scalar if there is one."""
-    return numpy_helper.from_array(np.array(values if len(values) > 1 else values[0], np.float32))
-
-
-def graph(
-    nodes: list[onnx.NodeProto], *constants: onnx.TensorProto, bands: tuple[int, int] = (1, 1)
-) -> onnx.ModelProto:
-    ends = [image_info("image", bands[0], None)], [image_info("restored", bands[1], None)]
-    model = make_model(helper.make_graph(nodes, "one", *ends, list(constants)), {}, microsoft=True)
-    onnx.checker.check_model(model)
-    return model
+    return values.astype(np.float32)
 
 
 class Row:
     """A network that is written operator by operator; each one reads the result of the last."""
 
     def __init__(self) -> None:
-        self.nodes: list[onnx.NodeProto] = []
-        self.weights: list[onnx.TensorProto] = []
+        self.nodes: list[str] = []
+        self.constants: dict[str, ArrayLike] = {}
         self.tensor = "image"
 
-    def add(self, kind: str, *others: onnx.TensorProto | str, **attributes: Any) -> "Row":
+    def add(self, kind: str, *others: ArrayLike | str, **attributes: Any) -> "Row":
         """Append an operator that reads the last result and `others`: constants or tensor names."""
         feeds = [self.tensor]
-        name = f"t{len(self.nodes)}"
+        self.tensor = f"t{len(self.nodes)}"
         for other in others:
-            feeds.append(other if isinstance(other, str) else f"{name}.{len(feeds)}")
-            if not isinstance(other, str):
-                self.weights.append(
-                    numpy_helper.from_array(numpy_helper.to_array(other), feeds[-1])
-                )
-        self.nodes.append(helper.make_node(kind, feeds, [name], **attributes))
-        self.tensor = name
+            if isinstance(other, str):
+                feeds.append(other)
+            else:
+                feeds.append(f"{self.tensor}_{len(feeds)}")
+                self.constants[feeds[-1]] = other
+        words = ", ".join(f"{key}={json.dumps(value)}" for key, value in attributes.items())
+        operator = f"{kind}<{words}>" if words else kind
+        self.nodes.append(f"{self.tensor} = {operator}({', '.join(feeds)})")
         return self
 
     def model(self, bands: tuple[int, int] = (1, 1)) -> onnx.ModelProto:
-        self.nodes[-1].output[0] = "restored"
-        return graph(self.nodes, *self.weights, bands=bands)
+        nodes = " ".join([*self.nodes, f"restored = Identity({self.tensor})"])
+        return network(nodes, self.constants, bands)
 
 
 SAME = "Conv<pads=[1,1,1,1]>"

@@ -7,7 +7,6 @@ import onnx
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from onnx import numpy_helper
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.tiling.receptive_field import Tiling, tiling_of
@@ -23,7 +22,7 @@ from tests.quant.tiling.small_networks import (
 FAR = 1 << 62
 SHAPES = {"w2": (2, 2), "w3": (3, 3), "w4": (4, 4), "w7": (7, 7), "w53": (5, 3)}
 CONSTANTS = {
-    **{name: numpy_helper.to_array(taps(name, 1, 1, *shape)) for name, shape in SHAPES.items()},
+    **{name: taps(name, 1, 1, *shape) for name, shape in SHAPES.items()},
     "gain": [[[3.0]]],
     "map": np.arange(1600.0).reshape(1, 1, 40, 40),
     "ramp": np.arange(40.0),
