@@ -13,6 +13,7 @@ from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.quant.samples.own import CALIBRATED_ON, digest_of
+from tests.quant.quick import uniform
 
 
 def test_a_sensor_of_the_same_name_and_other_numbers_is_another() -> None:
@@ -43,7 +44,7 @@ def test_a_folder_is_known_by_its_files(change: str, tmp_path: Path) -> None:
 
 def test_the_judged_file_does_not_choose_its_samples(model: Path) -> None:
     """All samples are judged. Those that the file claims as its calibration are named in a note."""
-    samples = np.random.default_rng(0).random((12, 1, 32, 40), np.float32)
+    samples = uniform(12, 1, 32, 40)
     # An iterator can be read only once.
     int8 = bd.quantize(model, samples=iter(samples[:8]))
     mixed = np.concatenate([samples[10:], samples[2:7]])
@@ -68,7 +69,7 @@ def test_numbers_of_another_type_are_refused_in_a_sentence() -> None:
 
 
 def test_samples_smaller_than_the_mirrored_border_are_refused() -> None:
-    samples = np.random.default_rng(0).random((4, 1, 2, 9), np.float32)
+    samples = uniform(4, 1, 2, 9)
     with pytest.raises(ImageError, match="at least 4 pixels a side, got 2 x 9"):
         bd.compare("convbeers-xs", samples=samples)
 

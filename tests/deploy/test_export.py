@@ -26,6 +26,7 @@ from beers_deploy.quant.tiling.receptive_field import tiling_of
 from tests.deploy.command_line import done, refused
 from tests.model.networks import behind_a_bank, plain, radius_px
 from tests.profiles.own_sensor import own_sensor
+from tests.quant.quick import uniform
 from tests.quant.tiling.small_networks import quantized_half_resolution
 
 
@@ -65,7 +66,7 @@ def test_a_network_behind_a_bank_is_exported_for_one_sensor(
     banked = behind_a_bank(Variant(1, 8, scale), 0.1)
     sensor = Sensor.load("pleiades-degraded").nominal()
     model = banked_to_onnx(Weights(arrays(banked.state_dict()), banked.variant, {}), sensor, {})
-    image = np.random.default_rng(1).random((2, 1, rows, columns), np.float32) * 0.02 + 0.4
+    image = uniform(2, 1, rows, columns, seed=1) * 0.02 + 0.4
     with torch.inference_mode():
         expected = for_sensor(banked, vector_tensor(sensor), network_bank(sensor))(
             torch.from_numpy(image)

@@ -20,6 +20,7 @@ from beers_deploy.profiles.sensor_numbers import numbers_of
 from beers_deploy.profiles.shipped import board_names, sensor_names
 from tests.deploy.documents import valid
 from tests.deploy.restoration.runs import simulated
+from tests.quant.quick import uniform
 
 SMALL = "convbeers-xs"
 
@@ -43,7 +44,7 @@ class Tiny(torch.nn.Module):
 
 @pytest.fixture(scope="module")
 def samples() -> np.ndarray:
-    return np.random.default_rng(0).random((8, 1, 32, 32), np.float32)
+    return uniform(8, 1, 32, 32)
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +91,7 @@ def test_values_are_copied_and_compared(tiny: bd.Network) -> None:
 
 
 def test_a_module_computes_as_in_torch(tiny: bd.Network) -> None:
-    images = np.random.default_rng(1).random((2, 1, 19, 23), np.float32)
+    images = uniform(2, 1, 19, 23, seed=1)
     with torch.inference_mode():
         expected = Tiny()(torch.from_numpy(images)).numpy()
     assert_allclose(tiny(images), expected, atol=1e-6)

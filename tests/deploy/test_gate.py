@@ -24,7 +24,7 @@ from beers_deploy.quant.session import open_session
 from beers_deploy.quant.structure import Relus, count_relus, rounded_tensors, saturated_shares
 from beers_deploy.verdict import file_checks
 from tests.deploy.command_line import done, refused
-from tests.quant.quick import change, changed, drawn, quantized_freely
+from tests.quant.quick import change, changed, drawn, quantized_freely, uniform
 from tests.quant.simplify.networks import parsed
 from tests.shipped import shipped_pair
 
@@ -155,7 +155,7 @@ def test_results_that_are_no_images_are_not_clipped_and_other_shapes_are_refused
         ends = f"float[N,1,H,W] x => float[N,{channels},H,W] y"
         return open_session(parsed("y = Conv(x, w, b)", ends, constants=constants))
 
-    image = np.random.default_rng(0).random((1, 1, 8, 9), np.float32)
+    image = uniform(1, 1, 8, 9)
     patches = Patches([(image, np.empty(0, np.float32))], [image])
     assert compare(shifted(-2), shifted(-3), patches).mae == pytest.approx(1)
     with pytest.raises(ModelError, match="1 x 3 x 8 x 9"):

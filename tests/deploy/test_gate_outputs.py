@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-import numpy as np
 import onnx
 import pytest
 
@@ -26,7 +25,7 @@ from beers_deploy.quant.sensor_bank.conditioned import WEIGHTS
 from beers_deploy.results import Table
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
-from tests.quant.quick import change
+from tests.quant.quick import change, uniform
 from tests.shipped import shipped_pair
 
 SMALL = "gate convbeers-xs --patches 1"
@@ -61,7 +60,7 @@ def test_the_digest_is_that_of_the_bytes_that_were_judged(
 
 
 def test_a_note_is_added_if_the_default_limit_is_exceeded(model: Path) -> None:
-    samples = np.random.default_rng(0).random((6, 1, 32, 40), np.float32)
+    samples = uniform(6, 1, 32, 40)
     verdict = bd.gate(bd.quantize(model, samples=samples), samples=samples)
     (mae,) = (check for check in verdict.checks if check.name == "MAE")
     notes = [note for note in verdict.notes if "`max_mae`" in note]

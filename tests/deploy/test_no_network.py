@@ -19,7 +19,6 @@ from typer.testing import CliRunner
 
 from beers_deploy.cli.commands import app
 from beers_deploy.model.convbeers import save_network
-from beers_deploy.model.variants import Variant
 from tests.deploy.documents import valid
 from tests.deploy.sealed import SOCKET_CALL
 from tests.model.networks import plain
@@ -67,7 +66,7 @@ def test_the_chain_opens_no_socket(
 ) -> None:
     weights = working_folder / "w.safetensors"
     scenes = working_folder / "scenes"
-    save_network(weights, plain(Variant(1, 4)), {"degraded": "pleiades-degraded"})
+    save_network(weights, plain(), {"degraded": "pleiades-degraded"})
     scenes.mkdir()
     rng = np.random.default_rng(0)
     tifffile.imwrite(scenes / "a.tif", rng.integers(200, 1800, (700, 700)).astype(np.uint16))

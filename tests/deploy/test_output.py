@@ -13,7 +13,7 @@ from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session
 from tests.deploy.command_line import done, refused
 from tests.deploy.test_one_answer import drawn
-from tests.quant.quick import one_guess
+from tests.quant.quick import one_guess, uniform
 
 OUTPUTS = ["restored", "large"]
 PARTS = ["convolution", "relu", "hard-swish", "split gate"]
@@ -50,7 +50,7 @@ def test_a_network_with_one_output_computes_the_same(
     path = tmp_path_factory.mktemp("drawn") / "a.onnx"
     drawn(path, parts, adds_image=adds_image, clips=False, has_two=True)
     model = load_onnx(path)
-    image = np.random.default_rng(0).random((2, 1, *sides), np.float32)
+    image = uniform(2, 1, *sides)
     expected = open_session(model).run([output], {"image": image})[0]
     kept = bd.Network.load(path).with_output(output)
     graph = kept.model.graph

@@ -12,7 +12,6 @@ import pytest
 from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.gate import Spread
@@ -27,6 +26,7 @@ from tests.deploy.command_line import done
 from tests.deploy.documents import valid
 from tests.deploy.report.svg import style_of, text_width
 from tests.model.networks import plain
+from tests.quant.quick import uniform
 from tests.quant.simplify.networks import parsed
 
 PHONE_PX = 358
@@ -35,7 +35,7 @@ PHONE_PX = 358
 
 def float_file(path: Path) -> str:
     """Write a small float network and return its path."""
-    save_onnx(to_onnx(plain(Variant(1, 4)), {}), path)
+    save_onnx(to_onnx(plain(), {}), path)
     return str(path)
 
 
@@ -51,7 +51,7 @@ def test_steps_of_fine_tuning_are_whole_or_auto(text: str) -> None:
 
 def test_the_patch_of_a_network_that_enlarges_is_shown_at_the_result_s_size() -> None:
     """The picture shows the patch next to both results, which may have more pixels."""
-    image = np.random.default_rng(0).random((1, 1, 9, 7), np.float32)
+    image = uniform(1, 1, 9, 7)
     ends = "float[1,1,H,W] x => float[1,1,P,Q] y"
     sizes = [1.0, 1.0, 2.0, 2.0]
     session = open_session(
@@ -66,7 +66,7 @@ def test_a_network_fixed_to_one_tile_is_quantized_reported_and_gated(tmp_path: P
     """A network of one tile size is accepted by both commands, and its INT8 file keeps the size."""
     floating = tmp_path / "f.onnx"
     int8 = tmp_path / "i.onnx"
-    save_onnx(to_onnx(plain(Variant(1, 4)), {}, tile_px=80), floating)
+    save_onnx(to_onnx(plain(), {}, tile_px=80), floating)
     options = ["--out", int8, "--patches", "2", "--patch", "64", "--report", tmp_path / "r"]
     done("quantize", floating, *options)
     done("gate --patches 3 --max-mae 0.1", floating, int8)
@@ -177,7 +177,7 @@ def test_labels_of_the_histogram_can_be_read_on_the_narrowest_page(farthest: int
 def test_a_report_on_samples_shows_the_worst_of_them(tmp_path: Path) -> None:
     """A report on a user's samples names them, and has no PSNR if they have no references."""
     float_file(tmp_path / "f.onnx")
-    np.save(tmp_path / "s.npy", np.random.default_rng(0).random((8, 1, 40, 48), np.float32))
+    np.save(tmp_path / "s.npy", uniform(8, 1, 40, 48))
     options = f"--samples {tmp_path}/s.npy --out {tmp_path}/i.onnx --report {tmp_path}/r"
     output = " ".join(done(f"quantize {tmp_path}/f.onnx {options}").split())
     document = valid(tmp_path / "r" / "report.json")

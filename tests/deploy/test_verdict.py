@@ -19,6 +19,7 @@ from beers_deploy.results import Input, Table
 from beers_deploy.verdict import Baseline, junit_text, read_baseline
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
+from tests.quant.quick import uniform
 
 ASKED: dict[str, Any] = {"sensor": "pleiades-degraded", "images": None, "patches": 2, "seed": 0}
 
@@ -128,7 +129,7 @@ def test_the_other_inputs_of_a_baseline_must_be_the_same(digest: str) -> None:
 def test_a_baseline_of_other_samples_in_memory_is_refused(model: Path, tmp_path: Path) -> None:
     """This holds also if both networks are files of one name."""
     (tmp_path / "int8").mkdir()
-    values = np.random.default_rng(0).random((8, 1, 32, 40), np.float32)
+    values = uniform(8, 1, 32, 40)
     int8 = bd.quantize(model, samples=values).save(tmp_path / "int8" / model.name)
     options: dict[str, Any] = {"limits": {"mae": 0.1}}
     before = bd.gate(model, int8, samples=values, **options).save(tmp_path / "before.json")

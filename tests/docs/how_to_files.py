@@ -13,7 +13,6 @@ from beers_deploy.model.convbeers import save_network
 from beers_deploy.model.shipped import SHIPPED
 from beers_deploy.model.simulator.acquire import acquire, prepare_scene
 from beers_deploy.model.simulator.detector import Draw, to_uint16
-from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.shipped import HERE as PROFILES
 from tests.deploy.studies.characterize.test_characterize import RATIO, SENSOR, landscape
 from tests.deploy.studies.detection.folders import Object, dior
@@ -107,9 +106,7 @@ def faulty_frames(folder: Path) -> None:
 
 def networks(folder: Path) -> None:
     """Write weights of a narrow network, and a detector that always finds the same object."""
-    save_network(
-        folder / "narrow.safetensors", plain(Variant(1, 4)), {"degraded": "pleiades-degraded"}
-    )
+    save_network(folder / "narrow.safetensors", plain(), {"degraded": "pleiades-degraded"})
     detector(folder / "yolo11n.onnx", raw((30, 20, 20, 10, 0.1, 0.9)))
 
 

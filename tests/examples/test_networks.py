@@ -10,6 +10,7 @@ from torch import nn
 
 from beers_deploy.quant.session import open_session
 from examples.networks import NETWORKS, build, to_onnx
+from tests.quant.quick import uniform
 
 MAX_DIFFERENCE = 1e-5
 
@@ -31,7 +32,7 @@ def differences(
     session = open_session(model)
     lines = []
     for size in sizes:
-        image = np.random.default_rng(0).random(size, np.float32)
+        image = uniform(*size)
         with torch.inference_mode():
             expected = network(torch.from_numpy(image)).numpy()
         (output,) = session.run(None, {"input": image})

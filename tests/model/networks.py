@@ -6,8 +6,10 @@ from beers_deploy.model.bank import bank_of_vector
 from beers_deploy.model.convbeers import BankedConvBEERS, Condition, ConvBEERS, initialise
 from beers_deploy.model.variants import Variant
 
+SMALL = Variant(blocks=1, features=4)
 
-def plain(variant: Variant, seed: int = 0) -> ConvBEERS:
+
+def plain(variant: Variant = SMALL, seed: int = 0) -> ConvBEERS:
     network = ConvBEERS(variant)
     initialise(network, torch.Generator().manual_seed(seed))
     return network.eval()

@@ -55,9 +55,7 @@ def test_a_saved_network_is_loaded_unchanged(network: Network, tmp_path: Path) -
 
 def test_without_a_scale_a_network_has_full_resolution(tmp_path: Path) -> None:
     path = tmp_path / "w.safetensors"
-    write_tensors(
-        path, arrays(plain(Variant(1, 4)).state_dict()), {"variant": {"blocks": 1, "features": 4}}
-    )
+    write_tensors(path, arrays(plain().state_dict()), {"variant": {"blocks": 1, "features": 4}})
     assert load_network(path)[0].variant.scale == 1
 
 
@@ -83,15 +81,13 @@ def refused(path: Path, words: str) -> None:
     ],
 )
 def test_a_header_that_does_not_fit_the_tensors_is_refused(variant: object, tmp_path: Path) -> None:
-    write_tensors(
-        tmp_path / "w.safetensors", arrays(plain(Variant(1, 4)).state_dict()), {"variant": variant}
-    )
+    write_tensors(tmp_path / "w.safetensors", arrays(plain().state_dict()), {"variant": variant})
     refused(tmp_path / "w.safetensors", r"weights of a ConvBEERS|number")
 
 
 @pytest.mark.parametrize("kind", [np.float64, np.float16, np.int32])
 def test_weights_of_another_type_are_refused(kind: type, tmp_path: Path) -> None:
-    tensors = arrays(plain(Variant(1, 4)).state_dict())
+    tensors = arrays(plain().state_dict())
     other: dict[str, np.ndarray] = {name: value.astype(kind) for name, value in tensors.items()}
     write_tensors(tmp_path / "w.safetensors", other, {"variant": {"blocks": 1, "features": 4}})
     refused(tmp_path / "w.safetensors", "not finite float32")
@@ -121,7 +117,7 @@ def test_a_missing_file_and_an_unknown_variant(tmp_path: Path) -> None:
 def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(MachineError, match="cannot be written"):
-        save_network(tmp_path / "file" / "w.safetensors", plain(Variant(1, 4)), {})
+        save_network(tmp_path / "file" / "w.safetensors", plain(), {})
 
 
 @pytest.mark.parametrize("name", shipped_names())
@@ -163,7 +159,7 @@ def test_loaded_arrays_are_copies(
 def test_others_can_read_what_is_written(tmp_path: Path) -> None:
     """A saved file has the permissions of any other new file, as the user's umask sets them."""
     (tmp_path / "plain").touch()
-    save_network(tmp_path / "w.safetensors", plain(Variant(1, 4)), {})
+    save_network(tmp_path / "w.safetensors", plain(), {})
     assert (tmp_path / "w.safetensors").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
@@ -179,7 +175,7 @@ def test_a_full_disk_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_conditioned_and_plain_weights_are_not_taken_for_one_another(tmp_path: Path) -> None:
     save_network(tmp_path / "conditioned.safetensors", conditioned(), {})
-    save_network(tmp_path / "plain.safetensors", plain(Variant(1, 4)), {})
+    save_network(tmp_path / "plain.safetensors", plain(), {})
     assert is_conditioned(tmp_path / "conditioned.safetensors")
     assert not is_conditioned(tmp_path / "plain.safetensors")
     with pytest.raises(ModelError, match="is conditioned on a sensor"):

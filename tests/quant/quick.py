@@ -43,6 +43,11 @@ def image(height: int = 37, width: int = 53, seed: int = 0, channels: int = 1) -
     return dn.astype(np.float32) / np.float32(4095)
 
 
+def uniform(*shape: int, seed: int = 0) -> np.ndarray:
+    """Return random values in [0, 1), float32."""
+    return np.random.default_rng(seed).random(shape, np.float32)
+
+
 def waves(count: int = 3) -> list[np.ndarray]:
     """Return smooth images (1, 1, 40, 40)."""
     rows, columns = np.mgrid[:40, :40] / 40
@@ -199,7 +204,7 @@ class Calibration(CalibrationDataReader):  # type: ignore[misc]  # onnxruntime h
 
 def quantized_freely(model: onnx.ModelProto, **options: Any) -> onnx.ModelProto:
     """Return a float network as onnxruntime quantises it, calibrated on noise."""
-    noise = list(np.random.default_rng(0).random((2, 1, 1, 32, 32), np.float32))
+    noise = list(uniform(2, 1, 1, 32, 32))
     with TemporaryDirectory() as folder:
         path = Path(folder) / "free.onnx"
         quantize_static(copied(model), path, Calibration(noise), **options)

@@ -13,9 +13,9 @@ from beers_deploy.quant.integer.agreement import agreement
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.quantize import Quantized
-from tests.quant.quick import changed
+from tests.quant.quick import changed, uniform
 
-IMAGE = np.random.default_rng(4).random((2, 1, 35, 41), np.float32)
+IMAGE = uniform(2, 1, 35, 41, seed=4)
 
 
 @pytest.mark.parametrize("path", sorted(SHIPPED.glob("*-int8.onnx")), ids=lambda path: path.stem)

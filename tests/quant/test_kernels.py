@@ -31,7 +31,7 @@ from beers_deploy.quant.kernels import (
 )
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session, run
-from tests.quant.quick import quantized_freely
+from tests.quant.quick import quantized_freely, uniform
 from tests.quant.simplify.networks import parsed
 from tests.shipped import shipped_pair
 
@@ -200,7 +200,7 @@ def test_a_relu_that_is_an_output_is_left_alone() -> None:
     model = load_onnx(SMALL[0])
     relu = next(node.output[0] for node in model.graph.node if node.op_type == "Max")
     model.graph.output.append(helper.make_tensor_value_info(relu, TensorProto.UINT8, None))
-    image = np.random.default_rng(0).random((1, 1, 13, 21), np.float32)
+    image = uniform(1, 1, 13, 21)
     as_written = open_session(model, 1, exact=False)
     exact = open_session(model, 1, exact=True)
     lowest = exact.run([relu], {"image": image})[0].min()

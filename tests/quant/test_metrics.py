@@ -12,7 +12,7 @@ from beers_deploy.quant.gate import compare
 from beers_deploy.quant.metrics import METRICS, metric_value
 from beers_deploy.quant.session import open_session
 from examples.networks import build, to_onnx
-from tests.quant.quick import one_guess, patches_of
+from tests.quant.quick import one_guess, patches_of, uniform
 
 
 def test_each_metric_is_computed_as_everywhere_else() -> None:
@@ -33,7 +33,7 @@ def test_references_of_another_size_are_refused() -> None:
 
 def test_a_gate_limits_the_loss_of_a_metric() -> None:
     network = bd.Network.load(to_onnx("dncnn", build("dncnn", torch.Generator().manual_seed(0))))
-    images = np.random.default_rng(0).random((12, 1, 32, 32), np.float32)
+    images = uniform(12, 1, 32, 32)
     noise = np.random.default_rng(1).normal(0, 0.02, images.shape)
     references = np.clip(network(images) + noise, 0, 1).astype(np.float32)
     with one_guess():
@@ -58,7 +58,7 @@ def test_a_gate_limits_the_loss_of_a_metric() -> None:
 
 
 def test_a_gate_of_classes_is_refused() -> None:
-    image = np.random.default_rng(0).random((1, 1, 8, 8), np.float32)
+    image = uniform(1, 1, 8, 8)
     classes = nn.Sequential(nn.Conv2d(1, 3, 3), nn.AdaptiveAvgPool2d(1), nn.Flatten())
     session = open_session(bd.Network.load(classes, example=image.shape).model)
     with pytest.raises(ModelError, match=r"must be images .*, but they are 1 x 3"):

@@ -11,10 +11,11 @@ from beers_deploy.quant.graph import CORRECTION
 from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.structure import rounded_tensors, saturated_shares
+from tests.quant.quick import uniform
 from tests.quant.simplify.networks import parsed
 from tests.shipped import shipped_pair
 
-IMAGE = np.random.default_rng(3).random((2, 1, 37, 43), np.float32)
+IMAGE = uniform(2, 1, 37, 43, seed=3)
 Lost = Callable[[np.ndarray], np.ndarray]
 ENDS = "float[N,1,H,W] image => float[N,1,H,W] restored"
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from beers_deploy.quant.session import open_session, run
+from tests.quant.quick import uniform
 from tests.shipped import shipped_pair
 
 IMAGE = np.full((1, 1, 96, 96), 0.5, np.float32)
@@ -31,7 +32,7 @@ def test_a_session_uses_no_cpu_time_after_its_run() -> None:
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_the_number_of_threads_changes_no_bit(threads: int) -> None:
-    image = np.random.default_rng(0).random((1, 1, 53, 71), np.float32)
+    image = uniform(1, 1, 53, 71)
     assert np.array_equal(
         run(open_session(shipped_pair()[1], threads), image),
         run(open_session(shipped_pair()[1]), image),

@@ -18,6 +18,7 @@ from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, Activ
 from beers_deploy.quant.integer.reference import correction
 from beers_deploy.quant.onnx.graph import constants
 from beers_deploy.quant.session import open_session, planes_of, run
+from tests.quant.quick import uniform
 
 ONE = Window(pads=(1, 1, 1, 1))
 TWO = Window(strides=(2, 2), pads=(1, 1, 1, 1))
@@ -77,7 +78,7 @@ def test_it_computes_the_bits_of_the_host_file(
 ) -> None:
     bits = {name: data.draw(st.integers(2, 7)) for name in ops.tensors(graph)}
     core = build_core(graph, {PLANES: PLANES_FRAC_BITS, **bits})
-    image = np.random.default_rng(seed).random((1, 1, tile_px, tile_px), np.float32)
+    image = uniform(1, 1, tile_px, tile_px, seed=seed)
     model = vint8_model(core, {}, tile_px)
     host = host_model(core, {})
     for optimise in (True, False):

@@ -16,12 +16,12 @@ from beers_deploy.quant.integer.reference import INT32_BITS
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.studies.stress.faults import with_ops
-from tests.quant.quick import assert_within_bounds
+from tests.quant.quick import assert_within_bounds, uniform
 
 
 def test_no_image_leaves_the_integer_bounds(quantized: Quantized) -> None:
     for seed in range(6):
-        noise = np.random.default_rng(seed).random((1, 1, 17, 23), np.float32)
+        noise = uniform(1, 1, 17, 23, seed=seed)
         pixels = noise if seed % 2 else np.rint(noise)
         assert_within_bounds(quantized.core, IMAGE_SLICES.encode(pixels))
 

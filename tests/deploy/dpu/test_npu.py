@@ -20,7 +20,7 @@ from tests.deploy.documents import figures_of, valid
 from tests.deploy.dpu.draws import rules_of
 from tests.deploy.dpu.graphs import QdqSketch, behind_qdq_conv
 from tests.model.networks import plain
-from tests.quant.quick import fix_sizes
+from tests.quant.quick import fix_sizes, uniform
 
 Draw = Callable[[QdqSketch, str], str]
 
@@ -131,7 +131,7 @@ def test_nothing_is_predicted_and_what_is_published_is_quoted(tmp_path: Path) ->
 def test_quantize_writes_vint8_and_the_configuration_of_the_compiler(tmp_path: Path) -> None:
     network, samples, core = (tmp_path / name for name in ("f.onnx", "s.npy", "core.onnx"))
     onnx.save(to_onnx(plain(Variant(blocks=1, features=4), seed=3), {}), network)
-    np.save(samples, np.random.default_rng(0).random((4, 1, 48, 48), np.float32))
+    np.save(samples, uniform(4, 1, 48, 48))
     command = f"quantize {network} --samples {samples} --out {tmp_path}/i.onnx --target vek385"
     assert "--tile" in refused(f"{command} --board-file {core}")
     assert "--board-file" in refused(f"{command} --tile 33")

@@ -1,6 +1,5 @@
 """Tests of the operators that the DPU refuses at a network's ends, and of their cost."""
 
-import numpy as np
 import onnx
 import pytest
 
@@ -14,7 +13,7 @@ from beers_deploy.performance.tables import host_words
 from beers_deploy.profiles.errors import ModelError
 from tests.deploy.dpu.draws import DPU, placed
 from tests.deploy.dpu.graphs import SAME, IntegerSketch, written
-from tests.quant.quick import patches_of, quickly
+from tests.quant.quick import patches_of, quickly, uniform
 from tests.quant.test_host_end import float_network
 
 
@@ -126,7 +125,7 @@ def test_results_of_few_bands_become_an_image_and_scores_do_not() -> None:
 def test_what_the_host_computes_in_float_takes_time_in_both_files() -> None:
     """The INT8 file states it in its description, and the float file by its operators."""
     network = float_network("Tanh of the correction of the enlarged image")
-    raw = np.random.default_rng(0).random((1, 2, 40, 40), np.float32)
+    raw = uniform(1, 2, 40, 40)
     int8 = quickly(network, patches_of([raw])).host
     work = float_work(Network.load(int8))
     assert work == FloatWork(("nearest", "Tanh"), copies=2)

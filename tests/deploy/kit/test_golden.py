@@ -32,7 +32,7 @@ from beers_deploy.quant.integer.reference import layer_sums, rounded
 from beers_deploy.studies.stress.faults import with_ops
 from examples.networks import build, to_onnx
 from tests.deploy.command_line import done, refused
-from tests.quant.quick import one_guess
+from tests.quant.quick import one_guess, uniform
 
 SHIPPED = ("convbeers-xs-int8", "convbeers-half-xs-int8")
 NORMALISED = "unet, normalised"
@@ -44,7 +44,7 @@ TILE_PX = 32
 def network(name: str) -> bd.Network:
     if name in SHIPPED:
         return bd.Network.load(name)
-    samples = np.random.default_rng(0).random((4, 1, 32, 32), np.float32)
+    samples = uniform(4, 1, 32, 32)
     normalised = name == NORMALISED
     name = name.partition(",")[0]
     with one_guess():

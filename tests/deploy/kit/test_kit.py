@@ -38,7 +38,7 @@ from tests.deploy.command_line import done
 from tests.deploy.kit.test_golden import NORMALISED, network
 from tests.model.networks import behind_a_bank
 from tests.profiles.own_sensor import departing, edited, own_sensor
-from tests.quant.quick import patches_of, quickly
+from tests.quant.quick import patches_of, quickly, uniform
 from tests.quant.sensor_bank.test_filters import textured
 from tests.quant.simplify.networks import parsed
 from tests.quant.test_host_end import float_network
@@ -70,7 +70,7 @@ def behind_fitted_kernels() -> bd.Network:
 def with_host_end() -> bd.Network:
     """Return a network whose result the host crops and adds to the enlarged image."""
     network = float_network("Tanh, enlarged image, and a crop of the mirrored border")
-    raw = np.random.default_rng(0).random((1, 2, 40, 40), np.float32)
+    raw = uniform(1, 2, 40, 40)
     return bd.Network.load(quickly(network, patches_of([raw])).host)
 
 
@@ -92,7 +92,7 @@ def test_the_host_part_gives_the_host_files_bytes(name: str, tmp_path: Path) -> 
     int8 = own[name]() if name in own else network(name)
     folder = BOARD.kit(int8, tmp_path / "kit", tile=96)
     shape = int8.tiling.channels_in, 131, 203
-    image = np.random.default_rng(1).random(shape, np.float32)
+    image = uniform(*shape, seed=1)
     image = 2 * image - 1 if name == NORMALISED else image
     np.save(tmp_path / "image.npy", image)
     files = [str(tmp_path / "image.npy"), str(tmp_path / "out.npy")]
@@ -117,7 +117,7 @@ def test_a_network_that_reads_its_whole_tile_has_a_kit_of_its_size(tmp_path: Pat
         "p = GlobalAveragePool(x) h = HardSigmoid<alpha=0.16666667, beta=0.5>(p) y = Mul(x, h)",
         "float[1,1,32,32] x => float[1,1,32,32] y",
     )
-    samples = np.random.default_rng(0).random((4, 1, 32, 32), np.float32)
+    samples = uniform(4, 1, 32, 32)
     int8 = bd.quantize(model, samples=samples, effort="fast", progress=False)
     folder = BOARD.kit(int8, tmp_path / "kit")
     assert np.load(folder / "input.npy").shape[2:] == (32, 32)

@@ -15,7 +15,6 @@ from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.convbeers import load_network, save_network
 from beers_deploy.model.io.tensors import read_weights
 from beers_deploy.model.shipped import shipped_names, shipped_weights
-from beers_deploy.model.variants import Variant
 from beers_deploy.network_files import int8_for_sensor
 from beers_deploy.profiles.errors import MachineError, ModelError, OptionError
 from beers_deploy.profiles.sensor import Sensor
@@ -30,7 +29,7 @@ from tests.deploy.restoration.runs import (
     stopped_after,
 )
 from tests.model.networks import plain
-from tests.quant.quick import one_guess
+from tests.quant.quick import one_guess, uniform
 
 NETWORK = "convbeers-xs-int8"
 OPTIONS: dict[str, Any] = {"network": NETWORK, "sensor": NAME, "interval": 90}
@@ -198,8 +197,8 @@ def test_other_weights_do_not_inherit_the_interval(tmp_path: Path) -> None:
     network, recipe = load_network(source)
     save_network(tmp_path / "w.safetensors", network, recipe)
     assert not read_weights(tmp_path / "w.safetensors").interval
-    model = to_onnx(plain(Variant(1, 4)), {"interval": "of the float network"})
-    samples = np.random.default_rng(0).random((2, 1, 48, 48), np.float32)
+    model = to_onnx(plain(), {"interval": "of the float network"})
+    samples = uniform(2, 1, 48, 48)
     with one_guess():
         int8 = bd.quantize(model, samples=samples)
     assert "interval" not in metadata(int8.model)

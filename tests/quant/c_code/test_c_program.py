@@ -21,6 +21,7 @@ from beers_deploy.quant.onnx_file import load_onnx
 from benchmarks.executors import run_c
 from tests.quant.c_code.compiled import FAST, SANITIZED, needs_compiler
 from tests.quant.c_code.drawn import KINDS, cores
+from tests.quant.quick import uniform
 from tests.shipped import shipped_pair
 
 
@@ -70,7 +71,7 @@ def shipped_core(name: str) -> IntCore:
 def planes_of(core: IntCore, tile_px: int) -> np.ndarray:
     """Return planes (2, P, H, W) of a tile: those of an image of noise, and the ends of int8."""
     shape = (1, core.host_part.image_channels, tile_px, tile_px)
-    image = np.random.default_rng(0).random(shape, np.float32)
+    image = uniform(*shape)
     planes = core.host_part.encode(image)
     return np.concatenate([planes, extremes(planes.shape)[1:]])
 

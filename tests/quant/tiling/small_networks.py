@@ -18,7 +18,7 @@ from beers_deploy.quant.onnx.image_input import any_size
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.tiling.receptive_field import tiling_of
-from tests.quant.quick import patches_of, quickly
+from tests.quant.quick import patches_of, quickly, uniform
 from tests.quant.simplify.networks import parsed
 
 
@@ -204,7 +204,7 @@ def quantized_half_resolution() -> Quantized:
     """Quantize `half_resolution` to legal INT8."""
     return quickly(
         half_resolution(),
-        patches_of(list(np.random.default_rng(5).random((2, 1, 1, 48, 48), np.float32))),
+        patches_of(list(uniform(2, 1, 1, 48, 48, seed=5))),
     )
 
 
