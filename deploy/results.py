@@ -18,7 +18,14 @@ from rich.console import Console
 from beers_deploy import __version__
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.processor import decided, processor_name
-from beers_deploy.profiles.errors import OptionError, as_path, encodable, one_line, printable
+from beers_deploy.profiles.errors import (
+    OptionError,
+    as_path,
+    counted,
+    encodable,
+    one_line,
+    printable,
+)
 from beers_deploy.profiles.figures import Check, Row, by_table
 from beers_deploy.tables.columns import LEGEND
 from beers_deploy.tables.frames import bars, tidy_frame, wide_frame
@@ -287,7 +294,10 @@ class Table:
         names = ", ".join(row.name for row in self.rows[:3]) + (
             ", ..." if len(self.rows) > 3 else ""
         )
-        return f"{type(self).__name__}({self.command}: {len(self.rows)} rows: {printable(names)})"
+        return (
+            f"{type(self).__name__}({self.command}: {counted(len(self.rows), 'row')}: "
+            f"{printable(names)})"
+        )
 
     def __str__(self) -> str:
         """Return the same text as `print`, without colours."""

@@ -103,6 +103,11 @@ def sizes(*counts_bytes: float) -> list[str]:
     return texts
 
 
+def counted(count: int, name: str) -> str:
+    """Return a count and a noun, such as "3 pixels". The noun has an "s" unless the count is 1."""
+    return f"{count} {name}{'' if count == 1 else 's'}"
+
+
 def _size(count_bytes: float, digits: int) -> str:
     for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count_bytes >= scale:

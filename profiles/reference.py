@@ -5,6 +5,7 @@ one.
 import logging
 import os
 
+from beers_deploy.profiles.errors import counted
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import REFERENCE
 
@@ -14,7 +15,7 @@ logger = logging.getLogger(__name__)
 def describe_units(profile: Sensor) -> str:
     """Return a phrase on the meaning of a digital number of a sensor: its gain, bits and offset."""
     gain, bits, offset_dn = profile.units
-    return f"{gain:g} DN per W/m2/sr/um, {bits:g} bits" + (
+    return f"{gain:g} DN per W/m2/sr/um, {counted(int(bits), 'bit')}" + (
         f", {offset_dn:g} DN of offset" if offset_dn else ""
     )
 

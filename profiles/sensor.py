@@ -16,7 +16,7 @@ from pydantic.dataclasses import dataclass
 
 from beers_deploy.profiles.constant import Constant, Limits, Stated
 from beers_deploy.profiles.effects import Effect, Effects, settled
-from beers_deploy.profiles.errors import ProfileError, as_path, require_numbers
+from beers_deploy.profiles.errors import ProfileError, as_path, counted, require_numbers
 from beers_deploy.profiles.instrument import (
     OFFSET,
     Instrument,
@@ -165,7 +165,8 @@ class Sensor:
         if offset_dn >= largest_dn:
             raise ValueError(
                 f"offset.offset_dn must be below {largest_dn:g}, the largest digital number of "
-                f"{self.bits} bits, but it is {offset_dn:g}. Correct one of the two."
+                f"{counted(int(self.bits.low), 'bit')}, but it is {offset_dn:g}. Correct one of "
+                "the two."
             )
         return self
 
@@ -289,14 +290,16 @@ class Sensor:
 
     def __repr__(self) -> str:
         across = self.mtf_nyquist
-        bits = self.bits
         noise = (
             f"SNR {self.snr_1} at {self.radiance_1} W/m2/sr/um"
             if self.snr_1
             else "noise by alpha and beta"
         )
         more = f", {', '.join(self.effects)}" if self.effects else ""
-        return f"Sensor({self.name!r}: {bits} bits, MTF {across} at Nyquist, {noise}{more})"
+        return (
+            f"Sensor({self.name!r}: {counted(int(self.bits.low), 'bit')}, MTF {across} at Nyquist, "
+            f"{noise}{more})"
+        )
 
     @property
     def units(self) -> tuple[float, float, float]:

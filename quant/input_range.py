@@ -58,7 +58,7 @@ def read_ranges(option: object, channels: int) -> Ranges:
     except (TypeError, ValueError) as error:
         raise OptionError(
             f"`input_range` must be LOW,HIGH with LOW below HIGH and sizes up to {SIZES[1]:g}, or "
-            f"such a pair for each of the network's {channels} channels, got "
+            f"such a pair for each channel of the network ({channels}), got "
             f"{printable(repr(option))}."
         ) from error
     ranges = ranges * (channels // len(ranges))

@@ -25,6 +25,7 @@ import numpy as np
 from onnx import ModelProto, helper, numpy_helper
 
 from beers_deploy.model.metrics.fidelity import psnr_db
+from beers_deploy.profiles.errors import counted
 from beers_deploy.profiles.figures import Figure, Row, measured
 from beers_deploy.quant.core import IntConv, dequantized
 from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
@@ -257,7 +258,7 @@ def price_rows(result: Quantized, held_out: Patches) -> list[Row]:
         name: samples.cost_of_step(graph, *restrictions) for name, restrictions in STEPS.items()
     }
     costs["INT8 as written"] = samples.cost(result_of(int8, image) for image, _ in samples.pairs)
-    source = f"{len(samples.pairs)} samples that calibration did not see"
+    source = f"{counted(len(samples.pairs), 'sample')} that calibration did not see"
     rows = []
     before = Cost(0.0, 0.0)
     for name, cost in costs.items():

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from beers_deploy.kit.golden import INDEX, PICTURE, Golden, files_of, read_array, read_golden
-from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.errors import ImageError, OptionError, counted
 from beers_deploy.profiles.figures import Check, Row, measured
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.graph import PLANES
@@ -48,7 +48,7 @@ def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[st
     rows = []
     for name, errors in outputs.items():
         values = sum(error.size for error in errors)
-        source = f"{len(errors)} cases, {values} values, against the integer reference"
+        source = f"{counted(len(errors), 'case')}, {values} values, against the integer reference"
         differing = 100 * sum(map(np.count_nonzero, errors)) / values
         largest = max(int(error.max()) for error in errors)
         figures = {
@@ -69,7 +69,7 @@ def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[st
                 needed |= set(op.inputs)
                 unseen += op.output != wrong[0]
         if unseen:
-            detail += f", {unseen} layers before it were not handed out"
+            detail += f", {counted(unseen, 'layer')} before it not handed out"
     return Table(
         title=f"{results_folder.name} against {Path(folder).name}",
         inputs=(golden.network, Path(folder) / INDEX),

@@ -18,6 +18,7 @@ from beers_deploy.model.consistency.step import Consistency
 from beers_deploy.model.processor import require_cores
 from beers_deploy.network import Network, NetworkLike, other_precision
 from beers_deploy.performance.timing import cpu_load, interleaved, resident_bytes
+from beers_deploy.profiles.errors import counted
 from beers_deploy.profiles.figures import Figure, Row, measured
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import TargetProfile
@@ -46,7 +47,9 @@ def _figures(samples: Samples, held_bytes: int) -> dict[str, Figure]:
     times_s = [time_s for time_s, _ in samples]
     times_ms = 1e3 * np.array(times_s)
     total_s = sum(times_s)
-    source = f"{len(times_s)} runs in {total_s:.1f} s after one for warm-up, loading left out"
+    source = (
+        f"{counted(len(times_s), 'run')} in {total_s:.1f} s after one for warm-up, loading left out"
+    )
     memory = "rise of resident memory once the file was opened and had run once"
     power = next((each for _, each in samples if each.value is None), samples[0][1])
     if power.value is not None:
@@ -116,7 +119,7 @@ def host_rows(
         correct()
         samples = interleaved([correct], min_runs, min_time_s)[0]
         times_ms = np.array([1e3 * time_s for time_s, _ in samples])
-        how = f"{len(times_ms)} runs on one thread after one for warm-up"
+        how = f"{counted(len(times_ms), 'run')} on one thread after one for warm-up"
         figures = {
             f"p{p}": measured(float(np.percentile(times_ms, p)), "ms/tile", how) for p in (50, 90)
         }

@@ -31,7 +31,7 @@ from beers_deploy.performance.swath import (
     swath_latency,
     throughput,
 )
-from beers_deploy.profiles.errors import OptionError, printable
+from beers_deploy.profiles.errors import OptionError, counted, printable
 from beers_deploy.profiles.figures import Figure, Row, number, predicted, published, unavailable
 from beers_deploy.profiles.target import TargetProfile
 
@@ -107,7 +107,7 @@ def processor_row(swath: Swath, board: TargetProfile) -> Row:
     if watts is not None:
         power = published(watts.low, "W", watts.source)
     constant = cpu.get(PIPELINE_TIME)
-    cores = f", {cpu['cores']} cores" if "cores" in cpu else ""
+    cores = f", {counted(cpu['cores'], 'core')}" if "cores" in cpu else ""
     name = f"traditional pipeline on the processor of {board.name}{cores}"
     if constant is None:
         reason = f"the target states no [cpu] {PIPELINE_TIME}"

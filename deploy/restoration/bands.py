@@ -14,7 +14,7 @@ from beers_deploy.conditioned_file import to_run_on
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.network_files import other_sensor
-from beers_deploy.profiles.errors import ModelError, OptionError, printable
+from beers_deploy.profiles.errors import ModelError, OptionError, counted, printable
 from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.shipped import BLIND
 
@@ -140,9 +140,9 @@ def in_order(items: Mapping[str, Each], raster: Raster) -> list[Each]:
     if len(items) != raster.bands or set(names) != set(items):
         names_text = f" ({printable(', '.join(stored_names))})" if stored_names else ""
         raise OptionError(
-            f"`sensor` must name a sensor for each of {raster.bands} bands{names_text}, got "
-            f"{printable(', '.join(items))}. Name every band of the image; pansharpening is out of "
-            "scope."
+            f"`sensor` must name a sensor for each of {counted(raster.bands, 'band')}{names_text}, "
+            f"got {printable(', '.join(items))}. Name every band of the image; "
+            "pansharpening is out of scope."
         )
     return [items[name] for name in names]
 

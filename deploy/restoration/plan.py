@@ -12,7 +12,7 @@ from itertools import product
 from typing import NamedTuple
 
 from beers_deploy.network import Network
-from beers_deploy.profiles.errors import ModelError, OptionError, printable
+from beers_deploy.profiles.errors import ModelError, OptionError, counted, printable
 from beers_deploy.profiles.figures import Figure, predicted
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.quant.tiling.receptive_field import Tiling
@@ -285,10 +285,9 @@ class Plan:
         bands = f", {self.bands} bands" if self.bands > 1 else ""
         larger = f", {self.scale} times as large" if self.scale > 1 else ""
         rows_px, columns_px = self.tile_shape
-        tiles = "1 tile" if self.tiles == 1 else f"{self.tiles} tiles"
         return (
-            f"plan: {self.width_px} x {self.height_px} pixels{bands}; {tiles} of {columns_px} x "
-            f"{rows_px}, "
+            f"plan: {self.width_px} x {self.height_px} pixels{bands}; "
+            f"{counted(self.tiles, 'tile')} of {columns_px} x {rows_px}, "
             f"halo {self.halo_words}, work factor {self.work_factor:.2f}{larger}"
         )
 

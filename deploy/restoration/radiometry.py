@@ -13,7 +13,7 @@ import numpy as np
 
 from beers_deploy.model.raster.facts import Extent, Raster
 from beers_deploy.model.raster.full_scale import settled_scale
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError, counted
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.profiles.sensor import Sensor
 
@@ -104,7 +104,7 @@ def full_scale_of(
             )
         return FullScale(requested, "asked for")
     if raster.bits is not None:
-        return FullScale(2**raster.bits - 1, f"{raster.bits} bits, as the file states")
+        return FullScale(2**raster.bits - 1, f"{counted(raster.bits, 'bit')}, as the file states")
     # A full scale that the type of the pixels cannot hold is not that of the image.
     if bits is None or (raster.dtype.kind != "f" and 2**bits - 1 > np.iinfo(raster.dtype).max):
         return FullScale(
@@ -116,4 +116,4 @@ def full_scale_of(
         if raster.dtype.kind == "f"
         else usual
     )
-    return FullScale(value, f"{bits} bits, of the sensor")
+    return FullScale(value, f"{counted(bits, 'bit')}, of the sensor")

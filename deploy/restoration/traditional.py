@@ -210,7 +210,7 @@ class TraditionalMethod:
             check_s=check_s,
             out_shape=raster.shape,
             identity={"method": "traditional", "quality": self.quality},
-            how=f"{torch.get_num_threads()} threads",
+            how=f"threads: {torch.get_num_threads()}",
             text={
                 "method": "traditional",
                 "sensor": ", ".join(sensor.name for sensor in sensors),

@@ -36,6 +36,7 @@ from beers_deploy.model.metrics.uneven_edge import (
     softness,
     strips_of,
 )
+from beers_deploy.profiles.errors import counted
 from beers_deploy.profiles.response import NYQUIST
 
 FREQUENCIES = np.round(np.arange(0.0, 0.71, 0.05), 2)
@@ -208,7 +209,7 @@ def _curve_of_sharpest(
         alike = precise & (np.abs(values - step) <= SHARP_DEVIATIONS * np.hypot(errors, SCATTER_PX))
         sharp = [edge for edge, is_sharp in zip(fitted, alike, strict=True) if is_sharp]
     if len(sharp) < least:
-        count = f"{len(sharp)} straight edge{'' if len(sharp) == 1 else 's'}"
+        count = counted(len(sharp), "straight edge")
         return Refusal(f"{count} of one sharpness, {least} are needed")
     values = values[precise]
     errors = errors[precise]

@@ -27,6 +27,7 @@ from beers_deploy.model.metrics.edge_search import Edge
 from beers_deploy.model.metrics.noise_blocks import Blocks, cut_blocks, join
 from beers_deploy.model.metrics.noise_line import SEED, Variance
 from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.profiles.errors import counted
 from beers_deploy.profiles.response import NYQUIST
 
 AXES = ("across", "along")
@@ -164,7 +165,7 @@ def _narrow(curve: MtfCurve | Refusal) -> MtfCurve | Refusal:
     if isinstance(curve, Refusal) or not curve.missing_edges:
         return curve
     value, (low, high) = curve.at(NYQUIST)
-    count = f"{curve.edges} edge{'' if curve.edges == 1 else 's'}"
+    count = counted(curve.edges, "edge")
     odd = (
         f"; these differ from the others: {', '.join(curve.contradicting)}"
         if curve.contradicting

@@ -19,6 +19,7 @@ import numpy as np
 
 from beers_deploy.model.metrics.noise_blocks import MIDDLE, ROUNDING, Blocks
 from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.profiles.errors import counted
 
 STRUCTURES = (10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
 """Limits of a block's structure relative to its noise; the smallest that leaves enough blocks is
@@ -139,7 +140,9 @@ def fit_noise(blocks: Blocks, incomplete: bool = False) -> NoiseModel | Refusal:
         The line, or the reason why these images do not determine one.
     """
     if blocks.mean.size < LEAST:
-        return Refusal(f"{blocks.mean.size} blocks of 16 x 16 unclipped pixels, {LEAST} are needed")
+        return Refusal(
+            f"{counted(blocks.mean.size, 'block')} of 16 x 16 unclipped pixels, {LEAST} are needed"
+        )
     quietest = float(np.percentile(blocks.fine, QUIET_PERCENT))
     # A restored or resampled image has less noise at the finest detail than a detector.
     if quietest < ROUNDING + LEAST_NOISE:
@@ -150,7 +153,9 @@ def fit_noise(blocks: Blocks, incomplete: bool = False) -> NoiseModel | Refusal:
     quiet, fit = _choose(blocks)
     parts = np.unique(quiet.part)
     if quiet.mean.size < LEAST or parts.size < LEAST_PARTS:
-        return Refusal(f"{quiet.mean.size} blocks without much texture, {LEAST} are needed")
+        return Refusal(
+            f"{counted(quiet.mean.size, 'block')} without much texture, {LEAST} are needed"
+        )
     dark, bright = (float(v) for v in np.percentile(quiet.mean, [EDGE_PERCENT, 100 - EDGE_PERCENT]))
     one_level = bright - dark < MIN_RANGE * bright
     if one_level and not incomplete:

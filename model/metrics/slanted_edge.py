@@ -55,7 +55,7 @@ def edge_mtf(image: np.ndarray, angle_deg: float, saturated: float = math.inf) -
     pixels = np.asarray(image, np.float64)
     not_finite = int((~np.isfinite(pixels)).sum())
     if not_finite:
-        return Refusal(f"{not_finite} pixels are not finite")
+        return Refusal(f"pixels that are not finite: {not_finite}")
     clipped = float(((pixels <= 0) | (pixels >= saturated)).mean())
     if clipped > MAX_CLIPPED:
         return Refusal(f"{clipped:.1%} of the pixels are clipped, {MAX_CLIPPED:.0%} at most")

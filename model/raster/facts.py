@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.errors import ImageError, counted
 
 SIDE_PX = 1 << 22
 BANDS = 1 << 12
@@ -237,8 +237,8 @@ def require_size(name: str, bands: int, height_px: int, width_px: int) -> None:
     """
     if max(height_px, width_px) > SIDE_PX or bands > BANDS:
         raise ImageError(
-            f"{name} has {bands} bands of {width_px} x {height_px} pixels, but at most {BANDS} "
-            f"bands of {SIDE_PX} pixels a side can be read. Cut it into pieces."
+            f"{name} has {counted(bands, 'band')} of {width_px} x {height_px} pixels, but at most "
+            f"{BANDS} bands of {SIDE_PX} pixels a side can be read. Cut it into pieces."
         )
 
 

@@ -11,7 +11,7 @@ from beers_deploy.model.io.files import IMAGE_SUFFIXES
 from beers_deploy.model.raster.facts import extent_of
 from beers_deploy.model.raster.full_scale import remedy_outside, settled_scale
 from beers_deploy.model.raster.reader import open_raster
-from beers_deploy.profiles.errors import ImageError, MachineError, sizes
+from beers_deploy.profiles.errors import ImageError, MachineError, counted, sizes
 from beers_deploy.profiles.instrument import MAX_DN
 
 CAMERA = r"[_-](?:dji|img|image|dsc[nf]?|fhd|mos|gopr|frame|p)[_-]?"
@@ -55,8 +55,8 @@ def read_pixels(path: Path) -> np.ndarray:
     count = int((raster.missing(stored) | ~np.isfinite(pixels)).sum())
     if count:
         raise ImageError(
-            f"{path} has {count} pixels that are NaN or infinite, or missing by its nodata value, "
-            "mask or alpha. Crop them off; only 'restore' accepts missing pixels."
+            f"{path} has {counted(count, 'pixel')} without a value: NaN, infinite, or missing by "
+            "nodata value, mask or alpha. Crop them off; only 'restore' accepts missing pixels."
         )
     return pixels[0] if raster.bands == 1 else np.moveaxis(pixels, 0, 2)
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from onnx import ModelProto
 
-from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.errors import ModelError, counted
 from beers_deploy.quant.graph.attention import aligned, shrinking
 from beers_deploy.quant.graph.host_end import host_end
 from beers_deploy.quant.graph.node_operations import ACTIVATIONS, READERS, read_activation, require
@@ -189,7 +189,8 @@ class _Reader:
         sizes = self.source.inputs[self.image]
         if len(sizes) != 4:
             raise unsupported(
-                f"The network's input must be (N, C, H, W), but it has {len(sizes)} dimensions."
+                "The network's input must be (N, C, H, W), but it has "
+                f"{counted(len(sizes), 'dimension')}."
             )
         return sizes[1] or 1
 
@@ -232,7 +233,7 @@ class _Reader:
         if dims and len(dims) != 4:
             raise unsupported(
                 f"The network's result must be an image or a map (N, C, H, W), but {result} has "
-                f"{len(dims)} dimensions.",
+                f"{counted(len(dims), 'dimension')}.",
                 NO_IMAGE,
             )
         for node in self.source.nodes:

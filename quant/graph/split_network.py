@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from beers_deploy.profiles.errors import LONGEST, ModelError, printable
+from beers_deploy.profiles.errors import LONGEST, ModelError, counted, printable
 from beers_deploy.quant.graph.base import THE_IMAGE, Base
 from beers_deploy.quant.graph.operations import (
     CORRECTION,
@@ -321,8 +321,8 @@ def check_result_size(graph: Graph, border_px: int, crop_px: int) -> None:
     extra = [2 * one - two - 2 * crop_px for one, two in zip(once, twice, strict=True)]
     if any(extra):
         raise unsupported(
-            f"The network's result is not its image's size or a multiple of it: {extra[0]:+d} "
-            f"rows and {extra[1]:+d} columns, because some layers lack padding.",
+            f"The network's result is not its image's size or a multiple of it: "
+            f"rows {extra[0]:+d}, columns {extra[1]:+d}, because some layers lack padding.",
             "Pad every convolution, or none: then the image is mirrored beyond its borders.",
         )
 
@@ -363,7 +363,8 @@ def _width(op: Op, widths: list[int]) -> int:
     if isinstance(op, HasWeight):  # in float or in integers
         if widths[0] != op.weight.shape[1] * op.groups:
             raise unsupported(
-                f"{op.name} needs {op.weight.shape[1] * op.groups} channels, got {widths[0]}."
+                f"{op.name} needs {counted(op.weight.shape[1] * op.groups, 'channel')}, got "
+                f"{widths[0]}."
             )
         return len(op.weight)
     if isinstance(op, Concat):

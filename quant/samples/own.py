@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from onnx import ModelProto
 
-from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
+from beers_deploy.profiles.errors import ImageError, ModelError, OptionError, counted
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.input_range import (
     FROM_SAMPLES,
@@ -251,8 +251,8 @@ def _finite(name: str, values: np.ndarray) -> np.ndarray:
     missing = np.count_nonzero(~np.isfinite(finite))
     if missing:
         raise ImageError(
-            f"{name} has {missing} values that are NaN or infinite. Leave out samples with missing "
-            "pixels."
+            f"{name} has {counted(missing, 'NaN or infinite value')}. Leave out samples with "
+            "missing pixels."
         )
     return finite
 
@@ -270,8 +270,8 @@ def _valid_reference(sample: str, reference: np.ndarray) -> np.ndarray:
 def _valid_image(name: str, image: np.ndarray, channels: int, ranges: Ranges | None) -> np.ndarray:
     if image.dtype.kind not in "fui" or len(image) != channels:
         raise ImageError(
-            f"The network reads {channels} channels of numbers, but {name} has {len(image)} "
-            f"channels of {image.dtype}. {REMEDY}"
+            f"The network reads {counted(channels, 'channel')} of numbers, but {name} has "
+            f"{counted(len(image), 'channel')} of {image.dtype}. {REMEDY}"
         )
     if not image.size:
         raise ImageError(f"{name} has no pixels: its shape is {format_shape(image)}. {REMEDY}")

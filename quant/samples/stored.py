@@ -132,7 +132,7 @@ def _paired(label: str, images: np.ndarray, references: np.ndarray) -> list[Pair
     """Return images with their references; raise ImageError if their numbers differ."""
     if references.ndim == 0 or len(references) != len(images):
         raise ImageError(
-            f"{label} must have a reference for each of its {len(images)} images, got references "
+            f"{label} must have a reference for each image ({len(images)}), got references "
             f"of {format_shape(references)}. {REMEDY}"
         )
     return list(zip(images, references, strict=True))

@@ -28,7 +28,7 @@ from fractions import Fraction
 import numpy as np
 from onnx import ModelProto, TypeProto
 
-from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.errors import ModelError, counted
 from beers_deploy.quant.graph.pixel_shuffle import MOVES, with_shuffles
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
 from beers_deploy.quant.onnx.image_input import fixed_tile_px
@@ -80,7 +80,7 @@ class Tiling:
     @property
     def words(self) -> str:
         """A description of bands, scale and alignment for messages."""
-        bands = f"of {self.channels_in} bands in and {self.channels_out} out"
+        bands = f"of {counted(self.channels_in, 'band')} in and {self.channels_out} out"
         return (
             f"{bands}, a result of {self.scale} times the image's size and tiles of "
             f"multiples of {self.alignment_px} px"

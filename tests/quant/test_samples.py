@@ -145,23 +145,23 @@ def cut_off(folder: Path) -> Path:
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        (array_file(RAMP), "reads 1 channels of numbers.*has 2"),
+        (array_file(RAMP), "reads 1 channel of numbers.*has 2"),
         (array_file(ONE_CHANNEL * 3e5), "a range of 0 to .*Divide them by full scale"),
-        (array_file(np.full((1, 1, 9, 9), np.nan)), "81 values that are NaN or infinite"),
+        (array_file(np.full((1, 1, 9, 9), np.nan)), "81 NaN or infinite values"),
         (array_file(RAMP[0, 0]), "a batch of"),
         (array_file(ONE_CHANNEL[..., :3, :3]), "at least 4 pixels a side, got 3 x 3"),
         (array_file(ONE_CHANNEL[:0]), "contains no sample"),
         (pickled, r"x\.npy cannot be read as samples"),
         (two_arrays, "got first, second"),
         (cut_off, r"x\.npz cannot be read as samples"),
-        (with_reference(np.array(0.5)), "a reference for each of its 3 images"),
+        (with_reference(np.array(0.5)), "a reference for each image .3."),
         (
             with_reference(np.full((3, 2), "text")),
             r"The reference of x.npz\[0\] must be of real numbers",
         ),
         (
             with_reference(np.array([0.5, np.nan, np.inf])),
-            r"x.npz\[1\] has 1 values that are NaN or infinite",
+            r"x.npz\[1\] has 1 NaN or infinite value\.",
         ),
         (with_reference(np.zeros((3, 2)), ONE_CHANNEL[:, :, :0]), "has no pixels"),
         (lambda folder: folder / "missing.npy", "no such file"),

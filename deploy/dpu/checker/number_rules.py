@@ -8,6 +8,7 @@ import numpy as np
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.finding import Finding, outside
 from beers_deploy.dpu.graph import Operation
+from beers_deploy.profiles.errors import counted
 from beers_deploy.quant.graph.quantized import Scale
 
 # ruff: noqa: ARG001 - every rule takes the operation and the DPU
@@ -144,7 +145,7 @@ def same_scale(op: Operation, dpu: Dpu) -> Finding | None:
     frac_bits = {role: p for role in op.scales if (p := _frac_bits(op, role)) is not None}
     if len(set(frac_bits.values())) < 2:
         return None
-    reason = ", ".join(f"{role} {p} fractional bits" for role, p in frac_bits.items())
+    reason = ", ".join(f"{role} {counted(p, 'fractional bit')}" for role, p in frac_bits.items())
     return Finding(reason, f"give them the smallest one; {AGAIN}")
 
 

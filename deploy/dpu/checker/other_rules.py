@@ -8,7 +8,7 @@ from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.conv_rules import alu_padding
 from beers_deploy.dpu.checker.finding import Finding, beyond_range, shown
 from beers_deploy.dpu.graph import CONVOLUTIONS, WINDOWED, Operation
-from beers_deploy.profiles.errors import sizes
+from beers_deploy.profiles.errors import counted, sizes
 from beers_deploy.quant.domains import SEPARATOR, foreign_remedy, is_foreign
 
 # ruff: noqa: ARG001 - every rule takes the operation and the DPU
@@ -336,6 +336,6 @@ def map_in_memory(op: Operation, dpu: Dpu) -> Finding | None:
     if size <= most:
         return None
     size_text, most_text = sizes(size, most)
-    reason = f"{size_text} for {dpu.batch} images, of {most_text}"
+    reason = f"{size_text} for {counted(dpu.batch, 'image')}, of {most_text}"
     # The size of a map grows with the square of the tile's side.
     return Finding(reason, f"use a tile of at most {math.sqrt(most / size):.2f} times this side")

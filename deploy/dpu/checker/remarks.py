@@ -53,7 +53,7 @@ def streaming(placement: Placement, dpu: Dpu, tile_px: int) -> str:
     # The size of a map grows with the square of the tile's side.
     side_px = math.isqrt(room * tile_px * tile_px // max(large))
     return (
-        f"{len(large)} of {len(sizes)} maps exceed {room / 2**20:g} MiB, the largest has "
+        f"{len(large)} of {len(sizes)} maps above {room / 2**20:g} MiB, the largest has "
         f"{max(large) / 1e6:.1f} MB: "
         f"they stream through memory; tiles of {side_px} px and less would keep every map on chip"
     )

@@ -18,7 +18,7 @@ from beers_deploy.dpu.board import Dpu, Levels, dpu_of
 from beers_deploy.dpu.checker.placement import Placement, place
 from beers_deploy.dpu.cost.latency import Prediction, predict
 from beers_deploy.dpu.reading import read_network
-from beers_deploy.profiles.errors import OptionError, printable
+from beers_deploy.profiles.errors import OptionError, counted, printable
 from beers_deploy.profiles.figures import Row, predicted, published
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.profiles.target import TargetProfile
@@ -154,7 +154,7 @@ def read_own_runs(path: Path, dpu: Dpu) -> OwnRuns:
         _run(entry, path, f"Run {number} in {path.name}", dpu)
         for number, entry in enumerate(entries, 1)
     ]
-    return OwnRuns(f"{len(runs)} runs in {path.name}, weighed by kinship", runs)
+    return OwnRuns(f"{counted(len(runs), 'run')} in {path.name}, weighed by kinship", runs)
 
 
 def _run(entry: Entry, path: Path, where: str, board: Dpu) -> Run:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from beers_deploy.model.raster.facts import Raster
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError, counted
 from beers_deploy.profiles.toml import unreadable
 
 FOUND = "found"
@@ -109,11 +109,6 @@ class FaultList:
         """Column, row and band of each fault, (n, 3)."""
         places = [(fault.column, fault.row, fault.band) for fault in self.faults]
         return np.array(places, np.int64).reshape(-1, 3)
-
-
-def counted(count: int, name: str) -> str:
-    """Return a count and a noun, such as "3 pixels". The noun has an "s" if the count exceeds 1."""
-    return f"{count} {name}{'s' if count > 1 else ''}"
 
 
 def found_list_path(out: Path, source: str) -> Path | None:

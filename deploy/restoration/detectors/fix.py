@@ -17,12 +17,11 @@ from beers_deploy.model.metrics.detector_pixels import PATCH_PX, wrong_pixels
 from beers_deploy.model.metrics.detector_stripes import Stripes
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.source import Source, strips
-from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.errors import ImageError, OptionError, counted
 from beers_deploy.restoration.detectors.fault_list import (
     FOUND,
     Fault,
     FaultList,
-    counted,
     read_list,
 )
 from beers_deploy.restoration.detectors.look import as_floats, look_at_detectors, value_steps

@@ -26,8 +26,9 @@ from beers_deploy.model.metrics.detector_pixels import wrong_pixels
 from beers_deploy.model.metrics.detector_stripes import Stripes, judge_lines
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.source import Source
+from beers_deploy.profiles.errors import counted
 from beers_deploy.profiles.figures import Figure, measured, unavailable
-from beers_deploy.restoration.detectors.fault_list import FOUND, counted
+from beers_deploy.restoration.detectors.fault_list import FOUND
 
 logger = logging.getLogger(__name__)
 

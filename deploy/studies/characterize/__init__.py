@@ -21,7 +21,7 @@ import numpy as np
 
 from beers_deploy.model.metrics.instrument import snr
 from beers_deploy.model.raster.writer import write_tiff
-from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.errors import ImageError, counted
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.results import Table, input_of
 from beers_deploy.studies.characterize.frames import MAX_DN, cut_box, open_frames
@@ -120,7 +120,7 @@ def measured_sensor(
         profile.write_text(toml, encoding="utf-8")
         count = len(measurement.frames.paths)
         table = Table(
-            title=f"sensor of {count} image{'' if count == 1 else 's'}",
+            title=f"sensor of {counted(count, 'image')}",
             # The files of arrays are gone after this block: they are digested here.
             inputs=tuple(map(input_of, measurement.frames.paths)),
             rows=tuple(measurement.rows()),

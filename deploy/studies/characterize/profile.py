@@ -12,7 +12,7 @@ from beers_deploy.model.metrics.instrument import AXES
 from beers_deploy.model.metrics.noise_blocks import SPECTRUM
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.profiles.constant import Status
-from beers_deploy.profiles.errors import OptionError, printable
+from beers_deploy.profiles.errors import OptionError, counted, printable
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.profiles.instrument import snr_0_bounds
 from beers_deploy.profiles.sensor import Sensor
@@ -169,7 +169,7 @@ class Measurement:
 
 def _blocks(noise: Noise) -> str:
     """Return the number of blocks and their kind, in words."""
-    still = f" of {noise.pairs} pairs of one scene each" if noise.pairs else ""
+    still = f" of {counted(noise.pairs, 'pair')} of one scene each" if noise.pairs else ""
     return f"{noise.model.blocks} blocks of 16 x 16{still}"
 
 
@@ -247,7 +247,7 @@ def _mtf_table(sensor: Measurement, images: str) -> dict[str, object]:
 
 
 def _edges(curve: MtfCurve) -> str:
-    return f"{curve.edges} edge{'' if curve.edges == 1 else 's'}"
+    return counted(curve.edges, "edge")
 
 
 def _noise_table(sensor: Measurement, images: str) -> dict[str, object]:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from beers_deploy.model.metrics.bootstrap import LEAST_SITES, percentiles, too_few
+from beers_deploy.profiles.errors import counted
 from beers_deploy.studies.detection.boxes import Boxes, areas, iou
 
 OVERLAPS = np.linspace(0.5, 0.95, 10)
@@ -182,7 +183,7 @@ def sites_note(sites: int) -> str:
     sites are missing or too narrow to be trusted; else an empty text.
     """
     few = (
-        f"Only {sites} sites: the intervals are too narrow to be trusted."
+        f"Only {counted(sites, 'site')}: the intervals are too narrow to be trusted."
         if sites < FEW_SITES
         else ""
     )

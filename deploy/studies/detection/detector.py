@@ -167,7 +167,7 @@ def open_detector(path: Path, size_px: int | None = None) -> Detector:
     is_read = len(outputs) == 1 and _is_read(outputs[0], len(names))
     if task != "detect" or channels != [3] or not is_read:
         shapes = ", ".join(" x ".join(map(str, sizes)) for sizes in outputs)
-        facts = f"task {task}, {' '.join(map(str, channels))} channels, output {shapes}"
+        facts = f"task {task}, channels {' '.join(map(str, channels))}, output {shapes}"
         raise ModelError(
             f"{path} must have a detector's output as Ultralytics exports it for RGB, "
             f"1 x {4 + len(names)} x anchors for {len(names)} classes (raw) or 1 x N x 6 (nms=True "

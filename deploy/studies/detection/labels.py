@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from beers_deploy.model.io.files import IMAGE_SUFFIXES
 from beers_deploy.model.raster.images import image_size_px, list_images
 from beers_deploy.model.raster.index import parse_xml
-from beers_deploy.profiles.errors import OptionError, printable, reason_of
+from beers_deploy.profiles.errors import OptionError, counted, printable, reason_of
 from beers_deploy.profiles.toml import read_json, read_whole
 from beers_deploy.studies.detection.boxes import Boxes, areas
 from beers_deploy.studies.detection.detector import letters
@@ -154,7 +154,7 @@ def _labelled_set(files: Sequence[_File], notes: Sequence[str] = ()) -> Labelled
     if all(truth.ignored.all() for truth in truths):
         raise OptionError(
             f"The labels must have at least one object that counts, but they have none on "
-            f"{len(images)} images. Check the labels."
+            f"{counted(len(images), 'image')}. Check the labels."
         )
     empty = sum(not len(truth) for truth in truths)
     ignored = sum(int(truth.ignored.sum()) for truth in truths)
@@ -279,8 +279,8 @@ def _read_coco(labels: Path, folder: Path) -> tuple[list[_File], list[str]]:
     listed = len(content["images"])
     if not files:
         raise OptionError(
-            f"None of the {listed} images that {labels} lists is in {folder}. Give the folder "
-            "that holds them."
+            f"No image that {labels} lists ({listed}) is in {folder}. Give the folder that holds "
+            "them."
         )
     paths = {one.image for one in files}
     if len(paths) < len(files):

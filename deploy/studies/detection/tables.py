@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from beers_deploy.model.metrics.bootstrap import too_few
+from beers_deploy.profiles.errors import counted
 from beers_deploy.profiles.figures import Figure, Row, measured, published, unavailable
 from beers_deploy.results import Table
 from beers_deploy.studies.detection.average_precision import DRAWS, SIZES_PX, interval, sites_note
@@ -151,7 +152,7 @@ def _figure(comparison: Comparison, values: np.ndarray, unit: str = PERCENT) -> 
     """
     if isnan(values[0]):
         return unavailable(unit, NO_OBJECT)
-    source = f"{len(comparison.scenes)} images of {comparison.sites} sites"
+    source = f"{counted(len(comparison.scenes), 'image')} of {counted(comparison.sites, 'site')}"
     ends = interval(values, comparison.sites)
     if ends is None:
         return measured(100 * float(values[0]), unit, source)

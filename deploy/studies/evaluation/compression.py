@@ -23,7 +23,7 @@ from PIL import Image
 
 from beers_deploy.model.metrics.fidelity import fidelity_db
 from beers_deploy.model.progress import steps
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError, counted
 from beers_deploy.profiles.figures import Row, measured
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.studies.evaluation.methods import DEGRADED, Method
@@ -174,7 +174,7 @@ class Trial:
         shares = self.chosen
         ground = self.ground_db[shares, np.arange(len(shares))]
         gain = self.board_db - ground
-        source = f"mean of {len(gain)} pairs"
+        source = f"mean of {counted(len(gain), 'pair')}"
         mean_gain = mean_over_sites(gain.tolist(), self.sites, seed, "dB", source)
         figures = {"on board minus on the ground": mean_gain}
         means = {
@@ -189,7 +189,7 @@ class Trial:
             figures[key] = measured(float(values.mean()), unit, source)
         apart = np.abs(self.rates[0] / self.rates[1] - 1).max()
         figures["rates of an image differ by up to"] = measured(
-            100 * float(apart), "%", f"largest of {len(gain)} pairs"
+            100 * float(apart), "%", f"largest of {counted(len(gain), 'pair')}"
         )
         error_dn = float(np.sqrt(self.error_dn2.mean()))
         figures["error of compression"] = measured(error_dn, "DN", f"root of the {source}")
@@ -231,7 +231,7 @@ def run_compression(
                 lossless_rates = [
                     8 * len(_code(_rounded(image, sensor.bits))) / image.size for image in several
                 ]
-                source = f"mean of {len(several)} images"
+                source = f"mean of {counted(len(several), 'image')}"
                 figures[key] = measured(float(np.mean(lossless_rates)), RATE, source)
             lossless.append(Row(LOSSLESS, method.name, figures))
             for rate, images in received.items():

@@ -29,7 +29,7 @@ from beers_deploy.model.pairs_recipe import read_pairs_recipe
 from beers_deploy.model.raster.images import list_images
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.pairs import Pair
-from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.errors import ImageError, OptionError, counted
 from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.untrusted import times
@@ -165,7 +165,7 @@ def run_evaluation(plan: Plan) -> Evaluation:
     names = f"{sensors[0].name} -> {sensors[1].name}"
     every = (*_in_order([*rows, *scores.paper_rows()]), *sensor_rows, *rates, *swept)
     return Evaluation(
-        title=f"{names}, {len(loaded)} image{'' if len(loaded) == 1 else 's'}",
+        title=f"{names}, {counted(len(loaded), 'image')}",
         arguments={
             "sensor": sensors[0].name,
             "reference": sensors[1].name,

@@ -18,6 +18,7 @@ from beers_deploy.model.metrics.bootstrap import site_interval
 from beers_deploy.model.metrics.fidelity import fidelity_db, ssim
 from beers_deploy.model.metrics.perceptual import Dists, Lpips, find_backbone, not_found
 from beers_deploy.model.progress import steps
+from beers_deploy.profiles.errors import counted
 from beers_deploy.profiles.figures import Figure, Row, measured, published, unavailable
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.studies.evaluation.methods import Method
@@ -248,7 +249,9 @@ class Instruments:
                 figures[key] = self.figure(key, first, "")
                 continue
             values, places = zip(*usable, strict=True)
-            source = f"mean of {len(values)} pairs from {len(set(places))} sites"
+            source = (
+                f"mean of {counted(len(values), 'pair')} from {counted(len(set(places)), 'site')}"
+            )
             unit = UNITS.get(key, DISTANCE)
             figures[key] = mean_over_sites(values, places, seed, unit, source)
             if key == BIAS:
@@ -314,7 +317,7 @@ def site_rows(images: Sequence[Row]) -> list[Row]:
             values = [value for row in own if (value := row.figures[key].value) is not None]
             figures[method] = own[0].figures[key]
             if values:
-                source = f"mean {key} of {len(values)} pairs"
+                source = f"mean {key} of {counted(len(values), 'pair')}"
                 figures[method] = measured(float(np.mean(values)), figures[method].unit, source)
         rows.append(Row(f"{key} by site", site, figures, {"images": str(len(own))}))
     return rows

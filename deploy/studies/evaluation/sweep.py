@@ -17,6 +17,7 @@ from beers_deploy.model.metrics.fidelity import fidelity_db
 from beers_deploy.model.progress import steps
 from beers_deploy.model.raster.images import site_of
 from beers_deploy.model.simulator.procedural import load_scenes
+from beers_deploy.profiles.errors import counted
 from beers_deploy.profiles.figures import Figure, Row
 from beers_deploy.profiles.instrument import Instrument, noise_from_snr
 from beers_deploy.profiles.sensor import Sensor
@@ -295,5 +296,5 @@ class SweepResult:
         """Return the mean of (N,) dB, one value for each image. For differences on the same images
         the interval is a paired one.
         """
-        source = f"mean of {len(values)} pairs"
+        source = f"mean of {counted(len(values), 'pair')}"
         return mean_over_sites(values.tolist(), self.sites, self.seed, "dB", source)

@@ -24,7 +24,7 @@ from beers_deploy.network import Network, NetworkLike
 from beers_deploy.performance.swath import PAPER_SIZE, Swath, parse_size
 from beers_deploy.performance.tables import PAPER_TARGET, published_rows
 from beers_deploy.performance.timing import interleaved
-from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.errors import ModelError, OptionError, counted
 from beers_deploy.profiles.figures import Check, Row, predicted
 from beers_deploy.profiles.figures import measured as measured_figure
 from beers_deploy.profiles.sensor import Sensor
@@ -374,8 +374,8 @@ def _notes(benchmark: Benchmark, boards: Sequence[str]) -> Iterator[str]:
         "published."
     )
     yield (
-        f"PSNR is the mean over {len(benchmark.pairs)} images of {sites} sites; clipped "
-        "pixels are left out."
+        f"PSNR is the mean over {counted(len(benchmark.pairs), 'image')} of "
+        f"{counted(sites, 'site')}; clipped pixels are left out."
     )
     yield (
         "Gains are differences on the same images from the next cheaper point of the front, with "

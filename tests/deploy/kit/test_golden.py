@@ -166,7 +166,7 @@ def test_layers_without_results_are_counted(vectors: Path, golden: Golden, tmp_p
     folder = results(golden, tmp_path / "r", run, lambda name: name == last)
     unseen = len(golden.core.ops) - 1
     detail = compare_golden(vectors, folder).checks[0].detail
-    assert detail.endswith(f", {unseen} layers before it were not handed out")
+    assert detail.endswith(f", {unseen} layers before it not handed out")
 
 
 def test_results_are_accepted_as_boards_write_them(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def test_the_size_is_the_file_s_or_the_one_asked_for(tmp_path: Path) -> None:
         (ONE, {"names": None}, "metadata of .* must have the names of its classes"),
         (ONE, {"names": "(" * 9000}, "the names of its classes"),
         (ONE, {"task": "segment"}, "task segment, "),
-        (ONE, {"channels": 1}, r"for RGB, 1 x 6 x anchors .* has task detect, 1 channels"),
+        (ONE, {"channels": 1}, r"for RGB, 1 x 6 x anchors .* has task detect, channels 1"),
         (ONE, {"outputs": 3}, r"output 1 x 6 x 20, 1 x 6 x 20, 1 x 6 x 20"),
         (
             np.zeros((1, 20, 7)),

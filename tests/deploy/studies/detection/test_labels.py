@@ -149,7 +149,7 @@ def test_labels_of_an_image_of_another_size_are_refused(tmp_path: Path) -> None:
             lambda folder: by_voc(folder, xml([]), "b.xml"),
             "1 of 1 files are missing in .*, the first 'a.xml'",
         ),
-        (lambda folder: by_voc(folder, xml([])), "none on 1 images"),
+        (lambda folder: by_voc(folder, xml([])), "none on 1 image"),
         (lambda folder: folder, "there is no image in it"),
         (lambda folder: text(text(coco(folder) / "b.json", "{}"), "{}"), "it has 2 .json files"),
     ],
@@ -198,7 +198,7 @@ def test_a_huge_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
         *(
             (
                 {"images": [{"id": 0, "file_name": name}], "annotations": []},
-                "None of the 1 images that .*labels.json lists",
+                "No image that .*labels.json lists .1. is in",
             )
             for name in ("../../etc/passwd", "/etc/passwd")
         ),
