@@ -14,9 +14,9 @@ import shutil
 import signal
 import sys
 from collections import deque
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from itertools import chain, groupby, product
 from pathlib import Path
@@ -113,7 +113,7 @@ def plan_windows(recipe: DatasetRecipe) -> list[Window]:
                 "scenes of at least that size."
             )
         names = ", ".join(str(path or "the drawn scene") for path in small)
-        raise ImageError(f"Less than {side} scene pixels a side: {names}. Leave that out.")
+        raise ImageError(f"Less than {side} scene pixels a side: {names}. Leave them out.")
     return windows
 
 
@@ -243,10 +243,11 @@ def write_dataset(
             # Ctrl-C reaches each process: those of the pool end without a traceback.
             end = signal.SIGINT, signal.SIG_DFL
             processes = min(workers, MOST_PROCESSES)
-            pool = stack.enter_context(ProcessPoolExecutor(processes, spawn, signal.signal, end))
-        for path, patches in stack.enter_context(
-            closing(_patches_by_path(recipe, waiting, workers, pool))
-        ):
+            pool = ProcessPoolExecutor(processes, spawn, signal.signal, end)
+            # The pool itself must cancel its calls: when its processes end while calls are
+            # cancelled from here, its thread fails with a traceback.
+            stack.callback(pool.shutdown, cancel_futures=True)
+        for path, patches in _patches_by_path(recipe, waiting, workers, pool):
             for window, patch in zip(waiting[path], patches, strict=True):
                 for role, dn in patch.images.items():
                     write_tiff(image_of(out, role, window.name), dn)
@@ -323,24 +324,20 @@ def _lines_left(
 
 def _patches_by_path(
     recipe: DatasetRecipe, waiting: dict[Path, list[Window]], workers: int, pool: Executor | None
-) -> Generator[tuple[Path, list[Patch]], None, None]:
+) -> Iterator[tuple[Path, list[Patch]]]:
     """Yield the patches of each part in order; two calls per worker run at any time."""
     if pool is None:
         for path, chunk in waiting.items():
             yield path, make_patches(recipe, chunk)
         return
     calls: deque[tuple[Path, Future[list[Patch]]]] = deque()
-    try:
-        for path, chunk in waiting.items():
-            calls.append((path, pool.submit(make_patches, recipe, chunk)))
-            if len(calls) > 2 * workers:
-                path, call = calls.popleft()
-                yield path, call.result()
-        for path, call in calls:
+    for path, chunk in waiting.items():
+        calls.append((path, pool.submit(make_patches, recipe, chunk)))
+        if len(calls) > 2 * workers:
+            path, call = calls.popleft()
             yield path, call.result()
-    finally:
-        for _, call in calls:
-            call.cancel()
+    for path, call in calls:
+        yield path, call.result()
 
 
 def _check_folder(recipe: DatasetRecipe, out: Path, resume: bool) -> None:
