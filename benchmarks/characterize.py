@@ -26,7 +26,7 @@ from beers_deploy.model.simulator.acquire import acquire_padded, fitting_oversam
 from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.model.simulator.sampling import crop_divisible, read_scene
-from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.errors import BeersError, ImageError
 from beers_deploy.profiles.figures import Figure
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
@@ -104,8 +104,13 @@ def main() -> None:
     parser.add_argument("--sensors", type=int, default=20)
     parser.add_argument("--seed", type=int, default=22)
     arguments = parser.parse_args()
-    photographs = [read_scene(path, LIKE).radiance for path in list_images(arguments.images)]
+    try:
+        photographs = [read_scene(path, LIKE).radiance for path in list_images(arguments.images)]
+    except BeersError as error:
+        parser.error(str(error))
     scenes = [each for each in photographs if fitting_oversampling(each, (RATIO,), MIN_SIDE_PX)]
+    if not scenes:
+        parser.error(f"every image in {arguments.images} is too small. Give larger images.")
     generator = np.random.default_rng(arguments.seed)
     errors = defaultdict[str, list[float]](list)
     inside = defaultdict[str, list[bool]](list)

@@ -39,6 +39,7 @@ from beers_deploy.model.simulator.acquire import (
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import read_scene
 from beers_deploy.network import Network
+from beers_deploy.profiles.errors import BeersError, ImageError
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
@@ -228,6 +229,8 @@ def judgements(
         image = acquired(path, sensor.draw, (number,), radiance=radiance)
         if image is not None and (image.raw < image.sensor.max_dn).any():
             results.append(judgement(name, image, interval))
+    if not results:
+        raise ImageError("Every image is too small or saturated. Give other images.")
     return results
 
 
@@ -306,14 +309,17 @@ def main() -> None:
     parser.add_argument("--images", type=Path, nargs="+", required=True)
     parser.add_argument("--plot", type=Path)
     arguments = parser.parse_args()
-    if arguments.task == "calibrate":
-        calibrate(arguments.names or shipped_names(), arguments.images)
-        return
-    first, *others = arguments.names or [f"{shipped_names()[0]}{INT8}"]
-    for text in tables(first, arguments.images, arguments.plot):
-        print(text, flush=True)
-    for name in others:
-        print(line(name, judgements(name, arguments.images, LIKE)), flush=True)
+    try:
+        if arguments.task == "calibrate":
+            calibrate(arguments.names or shipped_names(), arguments.images)
+            return
+        first, *others = arguments.names or [f"{shipped_names()[0]}{INT8}"]
+        for text in tables(first, arguments.images, arguments.plot):
+            print(text, flush=True)
+        for name in others:
+            print(line(name, judgements(name, arguments.images, LIKE)), flush=True)
+    except BeersError as error:
+        parser.error(str(error))
 
 
 if __name__ == "__main__":

@@ -54,11 +54,14 @@ def main() -> None:
         values = tuple(contrasts.tolist())
         response: Response = MtfTable(tuple(FREQUENCIES.tolist()), values, values)
         about = Stated(response, "stated", name)
-        table = bd.evaluate(
-            methods=arguments.methods,
-            images=arguments.images,
-            sensor=sensor.with_fields(response=response, **axes_of(response, about, about)),
-        )
+        try:
+            table = bd.evaluate(
+                methods=arguments.methods,
+                images=arguments.images,
+                sensor=sensor.with_fields(response=response, **axes_of(response, about, about)),
+            )
+        except bd.BeersError as error:
+            parser.error(str(error))
         for row in table.rows:
             # The published rows of the paper lack this figure.
             if row.table == "mean" and FIGURE in row.figures:

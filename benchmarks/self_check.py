@@ -24,6 +24,7 @@ from beers_deploy.model.consistency.blocks import Placed
 from beers_deploy.model.self_check import BLOCK_PX, Judged, SelfCheck
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.network import Network
+from beers_deploy.profiles.errors import BeersError
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.encodings import host_model, read_core
@@ -204,13 +205,16 @@ def main() -> None:
     parser.add_argument("--sweep", action="store_true")
     arguments = parser.parse_args()
     names = arguments.networks.split(",")
-    for line in wrong(arguments.images, names):
-        print(line, flush=True)
-    for name in names:
-        if arguments.flips and name.endswith("-int8"):
-            print(flips(arguments.images, name, arguments.flips), flush=True)
-    for line in right(arguments.images, names, sweep=arguments.sweep):
-        print(line, flush=True)
+    try:
+        for line in wrong(arguments.images, names):
+            print(line, flush=True)
+        for name in names:
+            if arguments.flips and name.endswith("-int8"):
+                print(flips(arguments.images, name, arguments.flips), flush=True)
+        for line in right(arguments.images, names, sweep=arguments.sweep):
+            print(line, flush=True)
+    except BeersError as error:
+        parser.error(str(error))
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from beers_deploy.model.shipped import INT8, shipped_names, shipped_weights
 from beers_deploy.network_files import Conditioned
+from beers_deploy.profiles.errors import BeersError
 from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.quant.passes.effort import Effort
 from beers_deploy.quantization import family_model
@@ -31,7 +32,10 @@ def main() -> None:
     for name in arguments.names:
         shipped = WEIGHTS / f"{name}{INT8}.onnx"
         network = Conditioned(name, shipped_weights(name))
-        int8 = family_model(network, arguments.images, effort=Effort.best)
+        try:
+            int8 = family_model(network, arguments.images, effort=Effort.best)
+        except BeersError as error:
+            parser.error(str(error))
         save_onnx(int8, shipped)
         print(shipped.name, flush=True)
 

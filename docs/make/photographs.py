@@ -55,7 +55,10 @@ def main() -> None:
     parser.add_argument("photographs", type=Path, help="folder of the test photographs")
     folder = parser.parse_args().photographs
     for view in VIEWS:
-        print(f"{view.picture}: {draw(folder / view.file, view)}")
+        try:
+            print(f"{view.picture}: {draw(folder / view.file, view)}")
+        except bd.BeersError as error:
+            parser.error(str(error))
 
 
 def draw(photograph: Path, view: View) -> str:

@@ -166,8 +166,8 @@ def simulate_pairs(
     if not pairs:
         least = oversamplings[-1] * (2 * acquire.MARGIN_PX + acquire.LEAST_SIDE_PX)
         raise ImageError(
-            f"The scenes in `images` must have {least} pixels a side or more, but all "
-            f"{len(small)} are smaller. Give larger images."
+            f"The scenes in `images` must have {least} pixels a side or more, but none "
+            f"of {len(small)} has. Give larger images."
         )
     return pairs, small
 
