@@ -150,7 +150,8 @@ def export_int8(
     core = read_core(model)
     side_px = tile or fixed_tile_px(model)
     side_px = require_tile(side_px, core.host_part.place_px)
-    for_board = Network(model, out.stem).core(target, tile) if core_file else None
+    # Also without a file for the board, because it refuses a tile that the layers do not fit.
+    for_board = Network(model, out.stem).core(target, tile) if core_file or tile else None
     host = host_model(core, metadata(model), side_px)
     if c_file is not None:
         digest = hashlib.sha256(host.SerializeToString()).hexdigest()

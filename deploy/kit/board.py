@@ -109,9 +109,9 @@ class Board(TargetProfile):
         # A missing library is refused before anything is written.
         if record:
             require_library()
-        core = network.core(self, tile)
         exposed = {} if profile is None else network.exposures
         facts = host_facts(network, tile, profile, exposed)
+        core = network.core(self, tile)
         # What an earlier kit in this folder states of its cores would be wrong of these.
         records = [folder / "record" / name for name in RECORD]
         others = [folder / name for name in ("known.json", "host.json", "host.py")]

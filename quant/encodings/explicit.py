@@ -13,7 +13,7 @@ from importlib.metadata import version
 import onnx
 from onnx import AttributeProto, ModelProto, NodeProto, helper, shape_inference
 
-from beers_deploy.profiles.errors import OptionError, reason_of
+from beers_deploy.profiles.errors import OptionError
 from beers_deploy.quant.domains import opset_of
 
 WINDOW_DEFAULTS = {
@@ -59,8 +59,8 @@ def made_explicit(model: ModelProto, texts: dict[str, str]) -> ModelProto:
         return shape_inference.infer_shapes(model, strict_mode=True)
     except shape_inference.InferenceError as error:
         raise OptionError(
-            f"The network does not fit this `tile`: {reason_of(error)}. Leave it out, or give the "
-            "size that the network was exported for."
+            "The network does not fit this `tile`, because its layers would have sizes that do not "
+            "match. Give a multiple of its strides, or the size that it was exported for."
         ) from error
 
 

@@ -24,6 +24,7 @@ from beers_deploy.quant.onnx_file import metadata, save_onnx
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from tests.deploy.command_line import done, refused
+from tests.deploy.kit import test_golden
 from tests.model.networks import behind_a_bank, plain, radius_px
 from tests.profiles.own_sensor import own_sensor
 from tests.quant.quick import uniform
@@ -182,3 +183,12 @@ def test_the_core_of_a_user_s_network_is_written_as_it_is(tmp_path: Path) -> Non
     done(f"{words} --c {tmp_path}/net.c")
     assert "void run(const int8_t *in, int8_t *out)" in (tmp_path / "net.c").read_text()
     assert "cannot be conditioned" in refused(f"{words} --sensor pleiades-degraded")
+
+
+def test_a_tile_that_the_strides_do_not_divide_is_refused(tmp_path: Path) -> None:
+    """No runtime would open the file."""
+    test_golden.network("unet").save(tmp_path / "own.onnx")
+    words = f"export --network {tmp_path}/own.onnx --out {tmp_path}/tile.onnx --tile"
+    assert "a multiple of its strides" in refused(f"{words} 66")
+    assert not (tmp_path / "tile.onnx").exists()
+    done(f"{words} 64")

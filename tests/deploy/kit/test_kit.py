@@ -326,6 +326,7 @@ def test_a_host_alone_has_no_kit_and_no_golden_vectors(tmp_path: Path) -> None:
         *((NAME, tile, "a whole number of 16 to 8192 px") for tile in (-1, 8, 64.5, "a", 10**6)),
         (NAME, 28, "at least 29 px, .* got 28 px"),
         ("unet", 48, "a multiple of 4 px and at least 52 px, .* got 48 px"),
+        ("unet", 66, "a multiple of 4 px and at least 52 px, .* got 66 px"),
     ],
 )
 def test_a_tile_that_no_core_has_is_refused(
