@@ -38,7 +38,6 @@ def open_session(
     model: Path | ModelProto,
     threads: int = 0,
     optimise: bool = True,
-    exact: bool | None = None,
 ) -> ort.InferenceSession:
     """Open a model in onnxruntime on the CPU such that integers are added exactly on every
     processor.
@@ -49,8 +48,6 @@ def open_session(
         model: a file or a model in memory.
         threads: the number of threads; 0 uses every core.
         optimise: False switches onnxruntime's optimisations off, so that the graph runs as written.
-        exact: True rewrites the model as for a processor whose int8 kernels saturate, False does
-            not. None finds out whether this processor is such a one.
 
     Raises:
         ModelError: the file cannot be trusted, or onnxruntime rejects it.
@@ -70,11 +67,10 @@ def open_session(
     name = "the network" if isinstance(model, ModelProto) else str(model)
     # Outside `contradictions`: the processor is asked with a network of its own, whose faults are
     # not this file's.
-    if exact is None:
-        exact = is_quantized(network) and not int8_adds_exactly()
+    saturates = is_quantized(network) and not int8_adds_exactly()
     with contradictions(name):
         network = with_wide_convolutions(network) if optimise else network
-        if exact and is_quantized(network):
+        if saturates:
             network = with_exact_sums(network)
     try:
         return ort.InferenceSession(

@@ -131,7 +131,6 @@ def acquire(
     sensor: Instrument,
     draw: Draw,
     role: str = "degraded",
-    offset_px: tuple[float, float] = (0.0, 0.0),
     margin_px: int = MARGIN_PX,
     skip: Collection[str] = (),
 ) -> np.ndarray:
@@ -142,7 +141,6 @@ def acquire(
         sensor: the instrument.
         draw: seed and patch number of the random effects.
         role: "degraded" or "reference"; keeps the two noises of a pair independent.
-        offset_px: the shift (down, right) of the sampling grid, in scene pixels.
         margin_px: the number of pixels of the image that are cropped on each side.
         skip: the names of effects that `detect` leaves out.
 
@@ -153,7 +151,7 @@ def acquire(
     height, width = scene.radiance.shape[-2:]
     transfer = sensor_transfer(height, width, ratio, sensor)
     # The transform wraps around: without a margin the far border leaks into the near one.
-    signal = crop_margin(sample(scene.spectrum, transfer, width, ratio, offset_px), margin_px)
+    signal = crop_margin(sample(scene.spectrum, transfer, width, ratio), margin_px)
     return detect(signal, sensor, draw, role, skip)
 
 

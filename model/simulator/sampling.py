@@ -35,7 +35,6 @@ def sample(
     transfer: np.ndarray,
     width: int,
     oversampling: int,
-    offset_px: tuple[float, float] = (0.0, 0.0),
 ) -> np.ndarray:
     """Blur a scene by `transfer`, and sample it at the centre of each target pixel.
 
@@ -48,7 +47,6 @@ def sample(
         transfer: (H, W // 2 + 1), see `mtf.transfer_function`.
         width: W in scene pixels.
         oversampling: r, scene pixels per target pixel.
-        offset_px: further shift of the sampling grid (down, right), in scene pixels.
 
     Returns:
         (..., H / r, W / r) float32. The borders wrap: crop a margin of real scene.
@@ -56,8 +54,8 @@ def sample(
     height = spectrum.shape[-2]
     centre = (oversampling - 1) / 2
     # For even r the centre lies between two scene pixels: slicing alone would shift the image.
-    ramp_y = _ramp(np.fft.fftfreq(height), centre + offset_px[0])
-    ramp_x = _ramp(np.fft.rfftfreq(width), centre + offset_px[1])
+    ramp_y = _ramp(np.fft.fftfreq(height), centre)
+    ramp_x = _ramp(np.fft.rfftfreq(width), centre)
     # Keeping every r-th row is adding up the r aliases of each frequency: what follows is r times
     # smaller.
     rows = height // oversampling

@@ -142,21 +142,21 @@ def match(truth: Boxes, detected: Boxes) -> tuple[np.ndarray, np.ndarray, np.nda
     return hits, ignored, matched
 
 
-def site_weights(sites: Sequence[str], seed: int, draws: int = DRAWS) -> np.ndarray:
+def site_weights(sites: Sequence[str], seed: int) -> np.ndarray:
     """Draw the weights of images for a bootstrap over sites, which gives the intervals of figures.
 
     Args:
         sites: the site of each of I images; images of one site resemble one another.
         seed: the seed of the draws.
-        draws: the number of draws with replacement of as many sites as there are.
 
     Returns:
-        The weights, (1 + draws, I) integers: a row of ones for the figure itself, then for each
-        draw the number of times that it contains the site of the image.
+        The weights, (1 + DRAWS, I) integers: a row of ones for the figure itself, then for each
+        draw, with replacement of as many sites as there are, the number of times that it contains
+        the site of the image.
     """
     names, site = np.unique(np.array(sites), return_inverse=True)
     generator = np.random.default_rng(seed)
-    counts = generator.multinomial(len(names), np.full(len(names), 1 / len(names)), size=draws)
+    counts = generator.multinomial(len(names), np.full(len(names), 1 / len(names)), size=DRAWS)
     # Images of one site share its count: the bootstrap draws whole sites.
     return np.vstack([np.ones(len(sites), np.int64), counts[:, site]])
 

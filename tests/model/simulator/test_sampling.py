@@ -72,15 +72,6 @@ def test_plain_slicing_would_shift_at_even_ratios(ratio: int) -> None:
     assert abs(centroid(sliced.astype(np.float64))[0]) == pytest.approx(0.5 / ratio, rel=0.05)
 
 
-@pytest.mark.parametrize("ratio", [1, 2, 3, 5])
-def test_an_offset_moves_the_grid_over_the_scene(ratio: int) -> None:
-    radiance = scene(13 * ratio, 21 * ratio)
-    transfer = transfer_function(13 * ratio, 21 * ratio, ratio, 0.07)
-    shifted = sample(scene_spectrum(radiance), transfer, 21 * ratio, ratio, offset_px=(2.0, -3.0))
-    rolled = stages.blurred(np.roll(radiance, (-2, 3), (0, 1)), ratio, 0.07)
-    assert_allclose(shifted, rolled, rtol=0, atol=1e-3)
-
-
 @pytest.mark.parametrize("factor", [1, 16])
 def test_counts_of_another_scale_are_warned_about(
     factor: int, caplog: pytest.LogCaptureFixture

@@ -199,27 +199,27 @@ def test_every_row_is_read_at_the_first_one_s_confidence() -> None:
     pairs = drawn(np.random.default_rng(7), 10)
     halved = [(truth, replace(found, scores=found.scores / 2)) for truth, found in pairs]
     rows = {"reference": hits_of(pairs), "halved": hits_of(halved)}
-    figures, confidence = score_rows(rows, NAMES, site_weights(list("abcdefghij"), 0, 5))
+    figures, confidence = score_rows(rows, NAMES, site_weights(list("abcdefghij"), 0))
     assert confidence == scored(pairs, NAMES)["own confidence"]
     assert figures["halved"]["recall"][0] == scored(halved, NAMES, confidence)["recall"]
     assert figures["halved"]["recall"][0] != figures["halved"]["own recall"][0]
 
 
 def test_a_draw_has_whole_sites_and_a_seed_gives_the_same_draws() -> None:
-    weights = site_weights(["a", "a", "b", "c"], 5, 200)
+    weights = site_weights(["a", "a", "b", "c"], 5)
     assert weights[0].tolist() == [1, 1, 1, 1]
     assert (weights[:, 0] == weights[:, 1]).all()
     assert (weights[1:, 1:].sum(axis=1) == 3).all()
-    assert_array_equal(weights, site_weights(["a", "a", "b", "c"], 5, 200))
-    assert not np.array_equal(weights, site_weights(["a", "a", "b", "c"], 6, 200))
+    assert_array_equal(weights, site_weights(["a", "a", "b", "c"], 5))
+    assert not np.array_equal(weights, site_weights(["a", "a", "b", "c"], 6))
 
 
 def test_a_class_without_an_object_in_a_draw_is_left_out() -> None:
     ship = Boxes.of(ONE, [0])
     pairs = [(ship, ship)] * 3 + [(Boxes.of(ONE, [1]), Boxes.of([], []))] * 2
-    figures = score(hits_of(pairs, 2), ("ship", "tank"), site_weights(list("abcde"), 0, 400))
+    figures = score(hits_of(pairs, 2), ("ship", "tank"), site_weights(list("abcde"), 0))
     assert set(figures["mAP50"]) == {0.0, 0.5, 1.0}
-    assert 0 < np.isnan(figures["mAP50 of tank"]).sum() < 400
+    assert 0 < np.isnan(figures["mAP50 of tank"]).sum() < 1000
     assert interval(figures["mAP50 of tank"], 5) == (0.0, 0.0)
 
 

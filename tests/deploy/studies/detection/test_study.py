@@ -99,7 +99,7 @@ def handmade(sites: int = 12, **counts: int) -> Comparison:
         for row, count in counts.items()
     }
     hits = {row: find_hits(truths, detected, len(NAMES)) for row, detected in boxes.items()}
-    weights = site_weights([item.site for item in scenes], 0, 200)
+    weights = site_weights([item.site for item in scenes], 0)
     figures, confidence = score_rows(hits, NAMES, weights)
     methods = {
         row: None if row == REFERENCE else Method(row, lambda dn: dn, "known") for row in counts
