@@ -152,7 +152,7 @@ class Sensor:
         for key, mtf in zip(("mtf_nyquist", "mtf_nyquist_along"), axes, strict=True):
             if mtf.high > limit:
                 raise ValueError(
-                    f"mtf.{key} must be at most {limit:.4f}, which an anti-alias filter of "
+                    f"mtf.{key} must be at most {limit:.4g}, which an anti-alias filter of "
                     f"{sigma.high:g} px leaves, but it is {mtf}. Lower one of the two."
                 )
         return self
