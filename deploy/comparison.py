@@ -13,7 +13,7 @@ from beers_deploy.model.io.files import IMAGE_SUFFIXES, sha256
 from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.shipped import INT8, VARIANT, shipped_weights
 from beers_deploy.network import Network, NetworkLike
-from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.errors import ImageError, OptionError, counted
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_numbers import numbers_of
 from beers_deploy.quant.encodings import CORE
@@ -214,8 +214,9 @@ def compared(
         count = sum(digest_of(degraded) in calibrated for degraded in patches.degraded)
         if count:
             notes.append(
-                f"by the INT8 file's own record, {count} of the {len(patches.pairs)} samples were "
-                "its calibration: on those INT8 loses less than on others"
+                f"by the INT8 file's own record, {count} of "
+                f"{counted(len(patches.pairs), 'sample')} calibrated it: on those INT8 loses less "
+                "than on others"
             )
     with faults_named(floating.label):
         float_session = open_any_size(floating.model)

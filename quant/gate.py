@@ -10,7 +10,7 @@ import numpy as np
 import onnxruntime as ort
 
 from beers_deploy.model.metrics.fidelity import psnr_db
-from beers_deploy.profiles.errors import ImageError, ModelError
+from beers_deploy.profiles.errors import ImageError, ModelError, counted
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.input_range import (
@@ -129,8 +129,9 @@ class GateResult:
     @property
     def source(self) -> str:
         """A description of the samples that the figures come from, such as "64 samples"."""
-        kind = "simulated patches of 128 x 128" if self.simulated else "samples"
-        return f"{self.patches} {kind}"
+        if self.simulated:
+            return f"{self.patches} simulated patches of 128 x 128"
+        return counted(self.patches, "sample")
 
     @property
     def drop_db(self) -> float:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.profiles.errors import ModelError, OptionError, optional, printable
+from beers_deploy.profiles.errors import ModelError, OptionError, counted, optional, printable
 from beers_deploy.profiles.shipped import DEFAULT_TARGET
 from beers_deploy.verbs.parameters import (
     Holds,
@@ -163,7 +163,7 @@ def quantize(
     if files[0] is not None:
         result.save(files[0])
         count = len(read_core(result.model).ops)
-        logger.info("wrote %s: %d integer operations", files[0], count)
+        logger.info("wrote %s: %s", files[0], counted(count, "integer operation"))
     if core is not None and files[1] is not None:
         save_core(core, files[1], board)
     assert result.origin is not None  # noqa: S101

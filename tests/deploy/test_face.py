@@ -120,7 +120,7 @@ def test_the_gate_notes_the_samples_of_the_calibration(
 ) -> None:
     verdict = bd.gate(int8, samples=samples, target="zcu102", limits={"mae": 0.01})
     verdict.raise_if_failed()
-    assert "6 of the 8 samples were its calibration" in verdict.notes[0]
+    assert "6 of 8 samples calibrated it" in verdict.notes[0]
     assert verdict.comparison.result.patches == 8
     with pytest.raises(
         AssertionError, match=r"gate FAILED, 1 of \d checks: MAE .* allowed at most 1e-09"
