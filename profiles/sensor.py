@@ -257,7 +257,11 @@ class Sensor:
 
     def with_fields(self, **fields: object) -> "Sensor":
         """Return this sensor with other fields, or raise ProfileError if they are invalid."""
-        return validated(Sensor, {**vars(self), **fields}, f"sensor {self.name}", GROUPS)
+        # A measured sensor has a table too, which does not hold for other numbers.
+        own = {
+            key: value for key, value in vars(self).items() if key in Sensor.__dataclass_fields__
+        }
+        return validated(Sensor, {**own, **fields}, f"sensor {self.name}", GROUPS)
 
     @property
     def reference(self) -> "Sensor":

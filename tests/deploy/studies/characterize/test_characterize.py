@@ -16,6 +16,7 @@ from beers_deploy.profiles.instrument import Instrument, noise_from_snr
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.characterize import Stated, measure, profile_toml
 from beers_deploy.verbs.characterize import characterize
+from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 
@@ -261,8 +262,10 @@ def test_a_profile_that_exists_is_replaced_only_if_asked(tmp_path: Path) -> None
     assert edited.read_text() == "edited by hand"
 
 
-def test_arrays_are_read_like_files() -> None:
-    """One number is an MTF, masked pixels are missing, and numbers below 0 do not wrap around."""
+def test_arrays_are_read_like_files(tmp_path: Path) -> None:
+    """One number is an MTF, masked pixels are missing, and numbers below 0 do not wrap around. The
+    sensor restores in memory as its file does.
+    """
     noisy = np.random.default_rng(0).normal(np.linspace(200, 3000, 320)[:, None], 20, (320, 320))
     pixels = noisy.astype(np.int32)
     corrupted = pixels.copy()
@@ -271,6 +274,10 @@ def test_arrays_are_read_like_files() -> None:
     sensor = characterize(masked, bits=12, mtf=0.08)
     assert sensor.snr_pair == characterize(masked.filled(0), bits=12, mtf="0.08").snr_pair
     assert sensor.mtf_nyquist.low == 0.08
+    restored = restore(pixels, network="convbeers-half-xs", sensor=sensor)
+    sensor.save(tmp_path / "my.toml")
+    as_file = restore(pixels, network="convbeers-half-xs", sensor=tmp_path / "my.toml")
+    assert np.array_equal(restored, as_file)
     with pytest.raises(BeersError, match="from 0 to 65535, but one has -"):
         characterize(pixels - 3000, bits=12, mtf=0.08)
 
