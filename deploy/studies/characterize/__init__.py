@@ -79,7 +79,7 @@ def measure(
     return Measurement(frames, noise, mtf, (snrs[0], snrs[1]), gain, stated)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class MeasuredSensor(Sensor):
     """The profile of a sensor that was measured on its own images, as `characterize` returns it.
 

@@ -274,6 +274,7 @@ def test_arrays_are_read_like_files(tmp_path: Path) -> None:
     sensor = characterize(masked, bits=12, mtf=0.08)
     assert sensor.snr_pair == characterize(masked.filled(0), bits=12, mtf="0.08").snr_pair
     assert sensor.mtf_nyquist.low == 0.08
+    assert repr(sensor).startswith("Sensor('measured': 12 bits, MTF 0.08")
     restored = restore(pixels, network="convbeers-half-xs", sensor=sensor)
     sensor.save(tmp_path / "my.toml")
     as_file = restore(pixels, network="convbeers-half-xs", sensor=tmp_path / "my.toml")
