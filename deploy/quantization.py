@@ -132,6 +132,11 @@ def quantized(
         )
     origin = Network.load(network, sensor=data.sensor).with_output(output)
     require_quantized(origin.model, origin.label, expected=False)
+    if origin.weights and not weights:
+        raise OptionError(
+            f"{origin.label} is computed for one sensor already, but it is calibrated over the "
+            f"whole family of sensors. Give {origin.weights.name!r} or its file, and `sensor`."
+        )
     with faults_named(origin.label):
         if weights:
             # One calibration serves all sensors of the trained range. The patches of one sensor

@@ -276,7 +276,7 @@ class Tally:
             impossible or self.clipped > MANY_AT_ENDS * max(self.compared, 1)
         ):
             raise ImageError(
-                f"The restoration of {name} is not plausible: "
+                f"{name} has no plausible restoration: "
                 f"{printable('; '.join(self.doubts))}. Check `full_scale`, check the network with "
                 "'gate', or write the result all the same with `force`."
             )

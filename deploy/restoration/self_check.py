@@ -117,7 +117,7 @@ class BlockMap:
             name: the name of the image, for the message.
         """
         if self.doubt:
-            raise ImageError(f"The restoration of {name} {self.doubt}")
+            raise ImageError(f"{name}: the restoration {self.doubt}")
 
 
 def checks_of(

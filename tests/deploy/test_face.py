@@ -293,6 +293,10 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
     ),
     "no sample": (lambda _: bd.quantize(Tiny(), samples=3), "or a path"),
     "no batch": (lambda raw: bd.quantize(Tiny(), samples=[raw]), "a batch of"),
+    "for one sensor": (
+        lambda _: bd.quantize(bd.Network.load(SMALL)),
+        "Give '.*' or its file, and `sensor`",
+    ),
     "empty": (lambda _: bd.quantize(Tiny(), samples=[]), "`samples` contains no sample"),
     "no raw image": (lambda _: bd.characterize([]), "one or several"),
     "no module's size": (

@@ -83,7 +83,9 @@ def test_a_network_for_another_sensor_is_reported(
     assert "the result fails the self-check" in caplog.text
     assert "`sensor` acquired the image" in caplog.text
     strict = tmp_path / "strict.tif"
-    with pytest.raises(ImageError, match=r"of .* fails the self-check: .* contradict the raw"):
+    with pytest.raises(
+        ImageError, match=r"restoration fails the self-check: .* contradict the raw"
+    ):
         run(image, strict, network=other_network, strict=True, self_check=tmp_path / "map.tif")
     assert names(tmp_path) == ["out.tif"]
 
