@@ -12,6 +12,7 @@ the end. Linear layers of torch stand between two such nodes.
 
 from collections.abc import Mapping
 from copy import deepcopy
+from typing import Any
 
 import numpy as np
 from onnx import ModelProto
@@ -157,7 +158,7 @@ def _layer_normalization(graph: OnnxGraph, node: Node, source: str, first: str) 
         f"{first}.{name}" for name in names
     )
     axes = []
-    attributes = {"axes": [1]}
+    attributes: dict[str, Any] = {"axes": [1]}
     if graph.opset >= AXES_ARE_INPUT:
         axes.append(graph.add_constant(f"{first}.axes", np.array([1]), np.int64))
         attributes = {}

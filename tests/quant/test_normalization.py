@@ -132,15 +132,14 @@ def test_only_the_deviation_is_approximated(
         # One pixel stands for all, so that its inverse deviation is a constant.
         image = np.full_like(image, level)
     values = tensor(model, normalization.source, image)[0].astype(np.float64)
-    axis = (1, 2)
     n_features = CHANNELS
     unit = np.linspace(1, 2, CHANNELS)
+    variances = values.var((1, 2))
     if normalization.is_of_pixels:
-        values = values[:, PX // 2, PX // 2]
-        axis = 0
+        variances = values[:, PX // 2, PX // 2].var()
         n_features = 2 * CHANNELS
         unit = np.ones(CHANNELS)
-    deviations = np.sqrt(values.var(axis) + normalization.epsilon)
+    deviations = np.sqrt(variances + normalization.epsilon)
     inverse = InverseDeviation(
         unit=unit,
         inner_weight=np.zeros((1, n_features)),
