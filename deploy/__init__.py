@@ -15,7 +15,6 @@ values, and write files only where they are given an output; each is a command t
   and the recipes that make the shipped networks.
 """
 
-import sys
 from typing import Any
 
 import lazy_loader
@@ -23,19 +22,12 @@ import lazy_loader
 import beers_deploy.quant  # noqa: F401  # switches telemetry off before a module here loads a runtime
 
 __version__ = "1.0.0"
-NO_DOCSTRINGS = (
-    "Python removed the docstrings, from which help and rules are read. Run it without -OO and "
-    "PYTHONOPTIMIZE=2."
-)
 
 _loaded, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> Any:
     """Load and return the public object with this name."""
-    # Rules of a DPU are read from docstrings: without them each network would look refused.
-    if sys.flags.optimize > 1:
-        raise ImportError(NO_DOCSTRINGS)
     try:
         return _loaded(name)
     except ImportError as error:

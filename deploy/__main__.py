@@ -5,8 +5,6 @@ on the PATH.
 import sys
 import traceback
 
-from beers_deploy import NO_DOCSTRINGS
-
 CRASHED = 70
 """The same as in `profiles.errors`. That module loads NumPy, which may be the library that does not
 load."""
@@ -15,12 +13,9 @@ load."""
 def main() -> None:
     """Run the command line `beers-deploy`.
 
-    The exit code is 2 if Python runs without docstrings, and 70 if a library of the installation
-    does not load. Python's own code for an uncaught error, 1, would mean that a gate failed.
+    The exit code is 70 if a library of the installation does not load. Python's own code for an
+    uncaught error, 1, would mean that a gate failed.
     """
-    if sys.flags.optimize > 1:
-        sys.stderr.write(f"beers-deploy: {NO_DOCSTRINGS}\n")
-        sys.exit(2)
     try:
         from beers_deploy.cli.commands import app
 

@@ -107,7 +107,7 @@ def processor_row(swath: Swath, board: TargetProfile) -> Row:
     if watts is not None:
         power = published(watts.low, "W", watts.source)
     constant = cpu.get(PIPELINE_TIME)
-    cores = f", {counted(cpu['cores'], 'core')}" if "cores" in cpu else ""
+    cores = f", {counted(int(cpu['cores'].low), 'core')}" if "cores" in cpu else ""
     name = f"traditional pipeline on the processor of {board.name}{cores}"
     if constant is None:
         reason = f"the target states no [cpu] {PIPELINE_TIME}"

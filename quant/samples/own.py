@@ -248,7 +248,7 @@ def read_samples(
 def _finite(name: str, values: np.ndarray) -> np.ndarray:
     """Return numbers as float32, or raise ImageError if some are NaN or infinite."""
     finite = np.asarray(values, np.float32)
-    missing = np.count_nonzero(~np.isfinite(finite))
+    missing = int(np.count_nonzero(~np.isfinite(finite)))
     if missing:
         raise ImageError(
             f"{name} has {counted(missing, 'NaN or infinite value')}. Leave out samples with "

@@ -207,11 +207,3 @@ def test_an_installation_that_does_not_work_is_no_failed_gate(module: str, tmp_p
     assert process.stderr.splitlines()[-1].startswith(
         "beers-deploy: this installation does not work"
     )
-
-
-def test_python_without_docstrings_is_one_sentence() -> None:
-    """Help and rules of a DPU are docstrings: `check` would refuse each network."""
-    command = [sys.executable, "-OO", "-m", "beers_deploy", "check", "convbeers-xs-int8"]
-    process = subprocess.run(command, capture_output=True, text=True)
-    assert process.returncode == 2
-    assert process.stderr.startswith("beers-deploy: Python removed the docstrings")
