@@ -15,11 +15,13 @@ from beers_deploy.quant.graph import (
     Mul,
     Op,
     Pointwise,
+    Resize,
     Shuffle,
 )
 from beers_deploy.quant.integer.arithmetic import (
     activated,
     activation_table,
+    bilinear_weights,
     mean_factor,
     saturated,
 )
@@ -117,6 +119,11 @@ def _accumulated(core: IntCore, op: IntConv | Op, ranges: Mapping[str, Range]) -
             op.kernel[0] * op.kernel[1] * factor * end.astype(np.int64)
             for end in _padded(inputs[0])
         )
+        return low, high, shift
+    if isinstance(op, Resize) and op.bilinear:
+        # The weights of each pixel add up to 2^shift.
+        _, shift = bilinear_weights(op.factor)
+        low, high = (end.astype(np.int64) << shift for end in inputs[0])
         return low, high, shift
     low, high = _moved(core, op, inputs)
     return low, high, 0
