@@ -221,14 +221,15 @@ def equalize_single(
                 candidate = best.factors.copy()
                 for name in names:
                     part = parts[name]
-                    weights = weights_of[name]
+                    # A convolution may have no weights but zeros.
+                    weights = np.maximum(weights_of[name], 1e-12)
                     factors = first_guess(ranges[part], *shape)
                     # 2. The weights that write a tensor share one scale, which the largest of them
                     # sets. A channel that is rarely active would otherwise be amplified until its
                     # weights determined the scale of all.
                     stronger = ranges[part] >= np.median(ranges[part])
                     limit = (weights * factors)[stronger].max()
-                    candidate[part] = np.minimum(factors, limit / np.maximum(weights, 1e-12))
+                    candidate[part] = np.minimum(factors, limit / weights)
                 best = _better(candidate, costs_of, best)
                 bar.advance()
         return best

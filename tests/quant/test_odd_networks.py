@@ -201,6 +201,15 @@ VALID = {
         sizes={"out": 40.0},
         out=(1200, 1, 3, 3),
     ),
+    "weights of zeros": sketch(
+        f"""c = {SAME}(in, c_w, c_b)
+        r = Relu(c)
+        correction = {SAME}(r, last_w, last_b)
+        out = Add(in, correction)""",
+        sizes={"c": 0.0},
+        c=(4, 1, 3, 3),
+        last=(1, 4, 3, 3),
+    ),
     "squeezed": sketch(
         f"""c = {SAME}(in, c_w, c_b)
         r = Relu(c)
