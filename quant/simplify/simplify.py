@@ -79,7 +79,8 @@ from beers_deploy.quant.simplify.spelled_activations import (
 )
 from beers_deploy.quant.simplify.standard_operators import (
     choose_by_relu,
-    drop_cast,
+    divide_by_reciprocal,
+    drop_cast_or_reshape,
     drop_where,
     float_shapes,
     pool_maximum,
@@ -171,6 +172,7 @@ def _run_passes(model: ModelProto) -> None:
         split_soft_threshold,
         choose_by_relu,
         replace_powers,
+        divide_by_reciprocal,
         drop_where,
     ):
         graph.rewrite(replacement)
@@ -195,7 +197,7 @@ def _run_passes(model: ModelProto) -> None:
     fold_in_front(graph)
     for with_shapes in (
         repeat_channels,
-        drop_cast,
+        drop_cast_or_reshape,
         pool_mean,
         pool_sums,
         pool_maximum,

@@ -131,6 +131,23 @@ def replace_powers(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return [node.replaced_by("Sqrt", [node.source])] if power == 0.5 else None
 
 
+def divide_by_reciprocal(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace a product with a Reciprocal by a quotient, as torch writes rsqrt.
+
+    Args:
+        graph: the graph that the node belongs to.
+        node: any node.
+
+    Returns:
+        The quotient; None if the node is something else.
+    """
+    for source, factor in zip(node.inputs, node.inputs[::-1], strict=True):
+        before = graph.writers.get(factor)
+        if node.op_type == "Mul" and before is not None and before.op_type == "Reciprocal":
+            return [node.replaced_by("Div", [source, before.source])]
+    return None
+
+
 def drop_where(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Remove a Where by a constant that chooses one of two maps everywhere, as torch writes a lerp.
 
@@ -154,10 +171,11 @@ def drop_where(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return []
 
 
-def drop_cast(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Remove a Cast to float32 of a tensor that is float32 already.
+def drop_cast_or_reshape(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Remove a Cast to float32 of a tensor that is float32 already, and a Reshape to its own size.
 
-    onnxruntime leaves such a Cast if it writes a result.
+    onnxruntime leaves such a Cast if it writes a result. torch writes such a Reshape around an
+    InstanceNorm2d that tracks its statistics.
 
     Args:
         graph: the graph that the node belongs to.
@@ -166,9 +184,13 @@ def drop_cast(graph: OnnxGraph, node: Node) -> list[Node] | None:
     Returns:
         An empty list if the node is removed; None if it stays.
     """
-    if node.op_type != "Cast" or node.source not in graph.shapes:
+    size = graph.shapes.get(node.source)
+    if size is None or graph.sole_writer(node.source) is None:
         return None
-    if graph.sole_writer(node.source) is None or node.attributes["to"] != TensorProto.FLOAT:
+    is_cast = node.op_type == "Cast" and node.attributes["to"] == TensorProto.FLOAT
+    # One free side follows from the others.
+    keeps_size = size == graph.shapes.get(node.result) and size.count(0) < 2
+    if not is_cast and not (node.op_type == "Reshape" and keeps_size):
         return None
     graph.rename(node.source, node.result)
     return []

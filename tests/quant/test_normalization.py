@@ -44,6 +44,7 @@ SPELLINGS = {
     "layer by hand, scaled first": MEAN + SQUARES + "r = Pow (s, half)\nw = Mul (d, gains)\n"
     "n = Div (w, r)",
     "without centring, as Restormer": MEAN + SQUARES + "r = Sqrt (s)\nn = Div (h, r)",
+    "layer by hand, by rsqrt": MEAN + SQUARES + "r = Sqrt (s)\ni = Reciprocal (r)\nn = Mul (i, d)",
     "layer": LAYER,
     "instance": INSTANCE,
     "instance by hand": IMAGE_BY_HAND,

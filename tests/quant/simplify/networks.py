@@ -322,6 +322,10 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         f"i = Identity(x) c = {SAME}(i, w) d = Dropout(c) y = Cast<to=1>(d)",
         {"Conv": 1},
     ),
+    "a Reshape to the same size": (
+        f"s = Resize(x, , , small) r = Reshape(s, small) y = {SAME}(r, w)",
+        {"Resize": 1, "Conv": 1},
+    ),
     "sizes computed from constants": (
         """z = ConstantOfShape<value = int64[1] {0}>(two)
         e = Slice(around, two, four)
