@@ -76,18 +76,37 @@ class Deviation:
             graph: the graph whose constants are extended.
         """
         result = self.root.result
-        names = [f"{result}.{part}" for part in ("mean", "difference", "above", "deviation")]
-        wide, difference, above, pooled = names
-        scales = graph.add_constant(f"{wide}.scales", np.array([1, 1, self.side_px, self.side_px]))
+        pooled = f"{result}.above"
         factor = 2 * RATIO * np.sqrt(self.scale).reshape(1, -1, 1, 1)
-        modes = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
         return [
-            Node.new("Resize", [self.negative, "", scales], wide, wide, **modes),
-            Node.new("Add", [self.source, wide], difference, difference),
-            Node.new("Relu", [difference], above, above),
-            Node.new("GlobalAveragePool", [above], pooled, pooled),
+            *above_mean(graph, self.source, self.negative, self.side_px, result),
             self.root.replaced_by("Mul", [pooled, graph.add_constant(f"{pooled}.factor", factor)]),
         ]
+
+
+def above_mean(
+    graph: OnnxGraph, source: str, negative: str, side_px: int, result: str
+) -> list[Node]:
+    """Return the nodes of `result`.difference, a map less its mean over the image, and of
+    `result`.above, the mean of what is above 0 of it.
+
+    Args:
+        graph: the graph, whose constants are extended.
+        source: the name of the map.
+        negative: the name of its mean, times -1.
+        side_px: the sides of the map; 0 if they are not known.
+        result: the name that the new names begin with.
+    """
+    wide, difference, positive = (f"{result}.{part}" for part in ("wide", "difference", "positive"))
+    side_px = side_px or 1  # A network of free size is refused later, by its pooling.
+    scales = graph.add_constant(f"{wide}.scales", np.array([1, 1, side_px, side_px]))
+    modes = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+    return [
+        Node.new("Resize", [negative, "", scales], wide, **modes),
+        Node.new("Add", [source, wide], difference),
+        Node.new("Relu", [difference], positive),
+        Node.new("GlobalAveragePool", [positive], f"{result}.above"),
+    ]
 
 
 @dataclass(frozen=True)

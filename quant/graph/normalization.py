@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beers_deploy.quant.graph.deviation import Deviation, less_mean, scaled
+from beers_deploy.quant.graph.deviation import Deviation, above_mean, less_mean, scaled
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.fold_affine import affine_chain
 
@@ -140,7 +140,7 @@ class Normalization:
             n_features = self.channels * (2 if self.is_of_pixels else 1)
             inverse = InverseDeviation.unknown(self.channels, n_features)
         result = self.last.result
-        names = [f"{result}.{part}" for part in ("features", "inner", "rectified", "inverse")]
+        names = [f"{result}.{part}" for part in ("above", "inner", "rectified", "inverse")]
         features, inner, rectified, factor = names
         in_units = self.source
         nodes = []
@@ -153,7 +153,7 @@ class Normalization:
         if self.is_of_pixels:
             nodes += self._of_pixels(graph, features)
         else:
-            nodes += self._of_image(graph, in_units, features)
+            nodes += self._of_image(graph, in_units)
         # 2.
         weight = (inverse.weight * self.scale.reshape(-1, 1))[:, :, None, None]
         inner_weight = -inverse.inner_weight[:, :, None, None]
@@ -189,28 +189,22 @@ class Normalization:
             Node.new("Relu", [absolute], features),
         ]
 
-    def _of_image(self, graph: OnnxGraph, in_units: str, features: str) -> list[Node]:
+    def _of_image(self, graph: OnnxGraph, in_units: str) -> list[Node]:
         """Return the nodes of the differences from the mean of the image, and of the features of
         the image.
 
         Args:
             graph: the graph, whose constants are extended.
             in_units: the name of the map in units of each channel.
-            features: the name of the features.
         """
-        parts = ("mean", "negative", "wide", "difference", "above")
-        mean, negative, wide, difference, above = (f"{self.last.result}.{part}" for part in parts)
+        result = self.last.result
+        mean = f"{result}.mean"
+        negative = f"{result}.negative"
         minus_one = graph.add_constant(f"{negative}.factor", np.array(-1))
-        side_px = self.side_px or 1  # A network of free size is refused later, by its pooling.
-        scales = graph.add_constant(f"{wide}.scales", np.array([1, 1, side_px, side_px]))
-        modes = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
         return [
             Node.new("GlobalAveragePool", [in_units], mean),
             Node.new("Mul", [mean, minus_one], negative),
-            Node.new("Resize", [negative, "", scales], wide, **modes),
-            Node.new("Add", [in_units, wide], difference),
-            Node.new("Relu", [difference], above),
-            Node.new("GlobalAveragePool", [above], features),
+            *above_mean(graph, in_units, negative, self.side_px, result),
         ]
 
 

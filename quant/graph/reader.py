@@ -131,14 +131,16 @@ class _Reader:
 
     def __init__(self, model: ModelProto) -> None:
         self.adaptable: AdaptableError | None = None  # the first
-        self.source = with_shuffles(self._with_attention(model))
+        self.source = with_shuffles(self._adapted(model))
         self.image, *_ = self.source.inputs
         self.ops: list[Op] = []
         self.border_px = self._take_mirror()
         self.end = host_end(self.source)
 
-    def _with_attention(self, model: ModelProto) -> ModelProto:
-        """Return the model with attention as `quant.adapt` replaces it, and note that."""
+    def _adapted(self, model: ModelProto) -> ModelProto:
+        """Return the model with attention and normalisations as `quant.adapt` replaces them, and
+        note that.
+        """
         network = deepcopy(model)
         graph = OnnxGraph(network)
         graph.shapes = float_shapes(graph)
