@@ -19,6 +19,7 @@ from onnx import ModelProto, helper
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.figures import Check
+from beers_deploy.quant.adapt.kinds import Kind, nodes_by_kind
 from beers_deploy.quant.bounds import within_int8
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings import encoding_faults, read_core
@@ -314,13 +315,15 @@ def structure_checks(
     float_relus = count_relus(float_model).explicit
     int8_relus = count_relus(int8)
     if (core := _own_core(int8)) is not None:
-        # `quant.adapt` computes LeakyReLUs and PReLUs by a ReLU in a second branch, and a Tanh by a
-        # ReLU6, the root of a standard deviation by a ReLU, and a division by it with another. They
-        # are those of the float network less the LeakyReLUs of the integers, the Tanh of the host
-        # and those behind a Softplus, which are parts of Mish.
+        # `quant.adapt` computes LeakyReLUs and PReLUs by a ReLU in a second branch, a Tanh by a
+        # ReLU6, a standard deviation by a ReLU, and a normalisation by two. They are those of the
+        # float network less the LeakyReLUs of the integers, the Tanh of the host and those behind a
+        # Softplus, which are parts of Mish.
         kinds = Counter(node.op_type for node in float_model.graph.node)
         float_relus += kinds["LeakyRelu"] + kinds["PRelu"] + kinds["Tanh"] - kinds["Softplus"]
-        float_relus += kinds["Sqrt"] + kinds["Div"] + 2 * kinds["InstanceNormalization"]
+        replaced = nodes_by_kind(OnnxGraph(float_model))
+        float_relus += len(replaced.get(Kind.deviation, ()))
+        float_relus += 2 * len(replaced.get(Kind.normalization, ()))
         float_relus -= sum(
             isinstance(op, IntConv | Pointwise) and op.activation is Activation.leaky_relu
             for op in core.ops

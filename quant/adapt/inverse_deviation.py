@@ -4,7 +4,8 @@
    least 0: that of channels with larger outliers is larger.
 2. Its inverse is convex and falls, as sums of ReLU(knot - a) times heights of at least 0 do.
 
-Both fits minimise the mean of the squared relative error (non-negative least squares).
+Both fits minimise the mean square error of the normalised map (non-negative least squares), so that
+pixels and images without contrast do not count: they become 0.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,6 +21,8 @@ KNOTS = 3
 """ReLUs of each inverse. With 6 a small NAFNet loses as much."""
 MOST_PIXELS = 20000
 """The maximum number of pixels that a normalisation over channels is fitted to."""
+LEAST_VARIANCE = 1e-12
+"""What is added to variances at least. Without it, maps without contrast would divide by 0."""
 SCALINGS = np.geomspace(0.5, 2, 9)
 """Factors of each image's statistics, so that an image of more or less contrast is fitted, too."""
 
@@ -46,7 +49,8 @@ def fit_inverses(
     inverses = {}
     for each, values in zip(normalizations, maps, strict=True):
         fit = _of_pixels if each.is_of_pixels else _of_image
-        inverses[each.last.result] = fit(np.concatenate(values).astype(np.float64), each.epsilon)
+        epsilon = max(each.epsilon, LEAST_VARIANCE)
+        inverses[each.last.result] = fit(np.concatenate(values).astype(np.float64), epsilon)
     return inverses
 
 
@@ -61,9 +65,9 @@ def _of_pixels(values: np.ndarray, epsilon: float) -> InverseDeviation:
     pixels = np.moveaxis(values, 1, -1).reshape(-1, channels)
     pixels = pixels[:: -(-len(pixels) // MOST_PIXELS)]
     differences = pixels - pixels.mean(1, keepdims=True)
-    deviations = np.sqrt(np.square(differences).mean(1) + epsilon)
+    variances = np.square(differences).mean(1)
     features = np.maximum(np.concatenate([differences, -differences], axis=1), 0)
-    weights, knots, heights, floor = _fit(features, deviations)
+    weights, knots, heights, floor = _fit(features, variances, epsilon)
     return InverseDeviation(
         unit=np.ones(channels),
         inner_weight=np.tile(weights, (KNOTS, 1)),
@@ -91,9 +95,10 @@ def _of_image(values: np.ndarray, epsilon: float) -> InverseDeviation:
     bias = np.zeros(channels)
     for channel in range(channels):
         features = np.outer(SCALINGS, above[:, channel]).reshape(-1, 1)
-        scaled_variances = np.outer(np.square(SCALINGS), variances[:, channel]).ravel()
-        deviations = np.sqrt(scaled_variances + epsilon) / unit[channel]
-        weights, knots, heights, floor = _fit(features, deviations)
+        in_units = variances[:, channel] / unit[channel] ** 2
+        scaled_variances = np.outer(np.square(SCALINGS), in_units).ravel()
+        fitted = _fit(features, scaled_variances, epsilon / unit[channel] ** 2)
+        weights, knots, heights, floor = fitted
         inner_weight[channel, :, channel] = weights
         inner_bias[channel] = knots
         weight[channel, channel] = heights
@@ -108,13 +113,14 @@ def _of_image(values: np.ndarray, epsilon: float) -> InverseDeviation:
 
 
 def _fit(
-    features: np.ndarray, deviations: np.ndarray
+    features: np.ndarray, variances: np.ndarray, epsilon: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Fit the inverse of deviations as a function of features.
+    """Fit the inverse of the deviation as a function of features.
 
     Args:
         features: (n, F) of n pixels or images, at least 0.
-        deviations: (n,) above 0.
+        variances: (n,).
+        epsilon: what is added to the variance.
 
     Returns:
         The weights (F,) of the features, the knots (KNOTS,) of their sum a, and the heights
@@ -122,13 +128,23 @@ def _fit(
 
             1 / deviation = sum(heights ReLU(knots - a)) + floor
     """
+    deviations = np.sqrt(variances + epsilon)
+    normalized = np.sqrt(variances) / deviations
     # 1.
-    weights, _ = nnls(features / deviations[:, None], np.ones(len(deviations)))
-    sums = features @ weights
+    weights = _non_negative(features * (normalized / deviations)[:, None], normalized)
     # 2.
-    low, high = np.maximum(np.percentile(sums, [0.05, 99.95]), np.finfo(np.float32).tiny)
+    typical = deviations[normalized >= normalized.max() / 2]
+    low, high = np.percentile(typical, [0.05, 99.95])
     knots = np.geomspace(low, high, KNOTS + 1)[1:]
-    lines = np.maximum(knots - sums[:, None], 0)
-    lines = np.concatenate([lines, np.ones((len(sums), 1))], axis=1)
-    (*heights, floor), _ = nnls(lines * deviations[:, None], np.ones(len(deviations)))
+    lines = np.maximum(knots - (features @ weights)[:, None], 0)
+    lines = np.concatenate([lines, np.ones((len(lines), 1))], axis=1)
+    *heights, floor = _non_negative(lines * np.sqrt(variances)[:, None], normalized)
     return weights, knots, np.array(heights), floor
+
+
+def _non_negative(rows: np.ndarray, results: np.ndarray) -> np.ndarray:
+    """Return the solution (F,) of least squares, at least 0, of rows (n, F) for results (n,)."""
+    # Of the triangular factor, because that is several times as fast for hundreds of features.
+    factor = np.asarray(np.linalg.qr(np.column_stack([rows, results]), mode="r"))
+    solution, _ = nnls(factor[:, :-1], factor[:, -1])
+    return np.asarray(solution)

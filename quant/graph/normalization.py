@@ -102,7 +102,6 @@ class Normalization:
     @classmethod
     def _of_quotient(cls, graph: OnnxGraph, node: Node) -> "Normalization | None":
         """Return the normalisation that is spelled out with a Div at its end."""
-        # Some add their epsilon to the root. It is left out.
         root_name, of_root = scaled(graph, node.inputs[1], is_sole=False)
         root = graph.writers.get(root_name)
         deviation = None if root is None else Deviation.of(graph, root)
@@ -116,7 +115,9 @@ class Normalization:
         if not channels or not (is_centred or numerator == source):
             return None
         scale = affine.scale / of_root.scale / np.sqrt(deviation.scale)
-        epsilon = deviation.epsilon / float(deviation.scale.max())
+        # Some add their epsilon to the root. Its square has a similar effect on the variance.
+        of_variance = deviation.epsilon + float((of_root.shift / of_root.scale).max()) ** 2
+        epsilon = of_variance / float(deviation.scale.max())
         return cls(
             node,
             source,
@@ -219,5 +220,7 @@ def lone_deviation(graph: OnnxGraph, node: Node) -> Deviation | None:
     deviation = Deviation.of(graph, node)
     if deviation is None or deviation.is_of_pixels:
         return None
-    readers = graph.readers[node.result]
-    return None if any(Normalization.of(graph, reader) for reader in readers) else deviation
+    quotients = [each for each in graph.nodes if each.op_type == "Div"]
+    normalizing = [each for each in quotients if Normalization.of(graph, each)]
+    roots = {scaled(graph, each.inputs[1], is_sole=False)[0] for each in normalizing}
+    return None if node.result in roots else deviation

@@ -15,9 +15,9 @@ from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.simplify import simplify
 from beers_deploy.quant.simplify.standard_operators import float_shapes
 from beers_deploy.quant.structure import structure_checks
-from tests.quant.quick import quickly
+from tests.quant.quick import changed, quickly
 from tests.quant.simplify.networks import parsed
-from tests.quant.test_adapt import HELD_OUT, SAMPLES, assert_near
+from tests.quant.test_adapt import HELD_OUT, SAMPLES, assert_near, squared_error
 
 CHANNELS = 6
 PX = 48
@@ -39,15 +39,25 @@ r = Sqrt (s)
 k = Div (d, r)
 n = Mul (k, gains)
 """
+GELU = """z = Div (k, root_of_two)
+e = Erf (z)
+g = Add (e, one)
+w = Mul (k, g)
+n = Mul (w, half)
+"""
 SPELLINGS = {
     "layer by hand, as NAFNet": MEAN + SQUARES + "r = Sqrt (s)\nk = Div (d, r)\nn = Mul (k, gains)",
     "layer by hand, scaled first": MEAN + SQUARES + "r = Pow (s, half)\nw = Mul (d, gains)\n"
     "n = Div (w, r)",
     "without centring, as Restormer": MEAN + SQUARES + "r = Sqrt (s)\nn = Div (h, r)",
     "layer by hand, by rsqrt": MEAN + SQUARES + "r = Sqrt (s)\ni = Reciprocal (r)\nn = Mul (i, d)",
+    "layer by hand, GELU behind": MEAN + SQUARES + "r = Sqrt (s)\nk = Div (d, r)\n" + GELU,
     "layer": LAYER,
     "instance": INSTANCE,
     "instance by hand": IMAGE_BY_HAND,
+    "instance by hand, added to the root": IMAGE_BY_HAND.replace(
+        "s = Add (v, epsilon)\nr = Sqrt (s)", "s = Sqrt (v)\nr = Add (s, small)"
+    ),
 }
 OF_PIXELS = {name for name in SPELLINGS if "layer" in name or "centring" in name}
 
@@ -77,7 +87,10 @@ def network(
         "offset": offset,
         "gains": gain.reshape(-1, 1, 1),
         "epsilon": np.array(0.001),
+        "small": np.array(1e-6),
         "half": np.array(0.5),
+        "one": np.array(1.0),
+        "root_of_two": np.sqrt(2),
         "axes": np.array([1]),
         "border": np.array([0, 0, 1, 1, 0, 0, 1, 1]),
     }
@@ -104,6 +117,16 @@ def test_each_spelling_is_replaced_near_to_the_original(spelling: str) -> None:
     assert_near(adapted, 30)
     int8 = quickly(adapted.model, SAMPLES)
     assert structure_checks(model, int8.host)[0].value == 0
+
+
+@pytest.mark.parametrize("spelling", ["layer", "instance by hand, added to the root"])
+def test_maps_without_contrast_become_zeros(spelling: str) -> None:
+    """As those of dead channels do, whatever is added to their variance."""
+    model = changed(network(spelling), "first", lambda weight: 0 * weight)
+    model = changed(model, "bias", lambda bias: 0 * bias)
+    adapted = adapt(model, SAMPLES, HELD_OUT)
+    int8 = quickly(adapted.model, SAMPLES)
+    assert squared_error(model, int8.host) < 1e-5
 
 
 @pytest.mark.parametrize("opset", [18, 19])
