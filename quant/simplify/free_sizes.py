@@ -35,6 +35,7 @@ from onnx import ModelProto
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Rewriting, sizes_of
 from beers_deploy.quant.onnx.image_input import without_size
+from beers_deploy.quant.simplify.fold_affine import affine_chain
 
 MULTIPLE_PX = 64
 """Six levels of a U-Net halve sides of this length without a remainder."""
@@ -98,6 +99,7 @@ def free_sizes(model: ModelProto, fold: Fold) -> ModelProto:
     graph = OnnxGraph(model)
     if not any(
         _is_rearrangement(graph, node)
+        or node.attributes.get("keepdims", 1) == 0
         or _leaves_pads(node)
         or (node.op_type in SIZED and (node.op_type != "Concat" or constants & {*node.inputs}))
         for node in graph.nodes
@@ -165,7 +167,7 @@ def _sized(graph: OnnxGraph, node: Node) -> list[Node] | None:
     before = graph.shapes.get(source, ())
     after = graph.shapes.get(node.result, ())
     if node.op_type == "Transpose" or (node.op_type in RESHAPING and before != after):
-        return _rearranged(graph, node)
+        return _with_kept_axis(graph, node) or _rearranged(graph, node)
     if len(before) != 4 or len(after) != 4 or min(*before, *after) < 1:
         return None
     if node.op_type in SPECIAL:
@@ -295,6 +297,27 @@ def _is_rearrangement(graph: OnnxGraph, node: Node) -> bool:
     return node.op_type in ("GatherND", "Tile") or (
         is_one and _chain(graph, node)[0] not in graph.inputs
     )
+
+
+def _with_kept_axis(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Return the mean of a map over its channels, times a constant, in place of one that drops the
+    axis, which a Reshape adds again, as torch writes a variance; None if the node is no such
+    Reshape.
+    """
+    source, affine = affine_chain(graph, node.source)
+    mean = graph.writers.get(source)
+    if mean is None or mean.op_type != "ReduceMean" or graph.numbers(mean, 1, "axes") != [1]:
+        return None
+    batch, _, *sides = graph.shapes.get(mean.source, (0, 0))
+    is_kept = len(sides) == 2 and graph.shapes.get(node.result) == (batch, 1, *sides)
+    if not is_kept or affine.shift.any():
+        return None
+    mean_name = f"{node.result}.mean"
+    factor = graph.add_constant(f"{mean_name}.factor", affine.scale)
+    return [
+        Node.new("ReduceMean", mean.inputs, mean_name, **{**mean.attributes, "keepdims": 1}),
+        node.replaced_by("Mul", [mean_name, factor]),
+    ]
 
 
 def _rearranged(graph: OnnxGraph, node: Node) -> list[Node] | None:

@@ -51,6 +51,11 @@ SPELLINGS = {
     "n = Div (w, r)",
     "without centring, as Restormer": MEAN + SQUARES + "r = Sqrt (s)\nn = Div (h, r)",
     "layer by hand, by rsqrt": MEAN + SQUARES + "r = Sqrt (s)\ni = Reciprocal (r)\nn = Mul (i, d)",
+    "layer by hand, by torch's variance": MEAN
+    + SQUARES.replace("keepdims = 1> (q)", "keepdims = 0> (q)\na = Reshape (v, size)").replace(
+        "Add (v", "Add (a"
+    )
+    + "r = Sqrt (s)\nn = Div (d, r)",
     "layer by hand, GELU behind": MEAN + SQUARES + "r = Sqrt (s)\nk = Div (d, r)\n" + GELU,
     "layer": LAYER,
     "instance": INSTANCE,
@@ -91,6 +96,7 @@ def network(
         "half": np.array(0.5),
         "one": np.array(1.0),
         "root_of_two": np.sqrt(2),
+        "size": np.array([1, 1, PX, PX]),
         "axes": np.array([1]),
         "border": np.array([0, 0, 1, 1, 0, 0, 1, 1]),
     }
