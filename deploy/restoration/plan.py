@@ -302,19 +302,18 @@ def plan_for(network: Network, shape: tuple[int, int, int], tiles: Tiles) -> Pla
 
     Raises:
         OptionError: the tile size, the halo or the number of bands does not fit the network, or the
-            network is fixed to one tile size, and `tiles` states another or the image is smaller,
-            or it reads its whole tile, the image is larger and no halo is given.
+            network is fixed to one tile size, and `tiles` or the image is smaller, or it reads its
+            whole tile, the image is larger and no halo is given.
         ModelError: the network returns an image whose size is no multiple of the image's.
     """
     tiling = network.geometry
     _, height_px, width_px = shape
-    if tiling.fixed_px is not None and (
-        tiling.fixed_px != tiles.side_px or min(shape[1:]) < tiling.fixed_px
-    ):
+    tile_px = tiling.fixed_px or tiles.side_px
+    if tiling.fixed_px is not None and tile_px > min(tiles.side_px, height_px, width_px):
         raise OptionError(
-            f"`tile` must be {tiling.fixed_px} px, the size to which the network is fixed, and the "
-            f"image at least as large, got {tiles.side_px} px and an image of {width_px} x "
-            f"{height_px} pixels. Use a network with free sizes."
+            f"The network is fixed to tiles of {tile_px} px. Neither the image, which has "
+            f"{width_px} x {height_px} pixels, nor `tile`, which is {tiles.side_px} px, may be "
+            "smaller."
         )
     is_one_tile = shape[1:] == (tiling.fixed_px, tiling.fixed_px)
     if not tiling.reads_whole or tiles.halo.isdecimal():
@@ -326,7 +325,7 @@ def plan_for(network: Network, shape: tuple[int, int, int], tiles: Tiles) -> Pla
             f"{tiling.reads_whole} To restore tiles independently, with seams between them, "
             "give `halo` a number of pixels, such as 8."
         )
-    return make_plan(shape, tiles.side_px, halo_px, tiling)
+    return make_plan(shape, tile_px, halo_px, tiling)
 
 
 def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, tiling: Tiling) -> Plan:

@@ -189,7 +189,10 @@ def test_what_cannot_be_restored_is_refused_in_one_sentence(
 
 
 def test_tiles_of_a_network_that_reads_its_whole_tile_are_independent(tmp_path: Path) -> None:
-    """An image of one tile is restored as it is, a larger one only with a halo that is given."""
+    """An image of one tile is restored as it is, a larger one only with a halo that is given.
+
+    The network's own size is used where larger tiles are allowed, and smaller ones are refused.
+    """
     nodes = "[pool] mean = GlobalAveragePool(image) sum = Add(image, mean)"
     model = network(f"{nodes} restored = Mul(sum, half)", {"half": 0.5})
     for value in (*model.graph.input, *model.graph.output):
@@ -205,7 +208,10 @@ def test_tiles_of_a_network_that_reads_its_whole_tile_are_independent(tmp_path: 
     for halo in ("exact", "x"):
         with pytest.raises(OptionError, match=r"pool reads the whole image.* give `halo`"):
             by_file(pixels, tmp_path, path, 32, halo=halo)
-    result = by_file(pixels, tmp_path, path, 32, halo="4")
+    for side_px, height_px in ((16, 70), (32, 31)):
+        with pytest.raises(OptionError, match="fixed to tiles of 32 px"):
+            by_file(pixels[:height_px], tmp_path, path, side_px, halo="4")
+    result = by_file(pixels, tmp_path, path, 640, halo="4")
     assert_allclose(result[:28, :28], halved(tile)[:28, :28], atol=1)
     assert_allclose(result[52:, 28:], halved(pixels[38:, 18:])[14:, 10:], atol=1)
 
