@@ -59,7 +59,7 @@ INSTEAD = {
     "Softplus": "train with ReLU; as a part of Mish, x * Tanh(Softplus(x)), with HardSwish",
     "Clip": "use ReLU, or ReLU6 (Clip from 0 to 6)",
     "ReduceSum": "use a 1 x 1 convolution of ones",
-    "ReduceMean": "use GlobalAveragePool",
+    "ReduceMean": "use GlobalAveragePool; 'quantize --adapt' replaces layer normalisation",
     "Transpose": "keep the layout (N, C, H, W) throughout",
     "Reshape": (
         "leave it to the host, or do without it; around InstanceNormalization it is a part of "
