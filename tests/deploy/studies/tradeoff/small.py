@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from beers_deploy.restoration.method import Restore
-from beers_deploy.studies.tradeoff import measure, points
+from beers_deploy.studies.tradeoff import measure, run
 
 
 @contextmanager
@@ -17,8 +17,8 @@ def small_studies() -> Iterator[None]:
         for module, name, value in (
             (measure, "PATCHES", 2),
             (measure, "PATCH_PX", 32),
-            (points, "QUALITIES", ("fast",)),
-            (points, "BASELINES", ()),
+            (run, "QUALITIES", ("fast",)),
+            (run, "BASELINES", ()),
             (measure, "host_times", _steady),
         ):
             patch.setattr(module, name, value)
