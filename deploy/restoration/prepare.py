@@ -213,11 +213,8 @@ class NetworkRestoration(Restoration):
             figures["brightened pixels"] = measured(share, "%", "restored at an exposure above 1")
         if self.restorer.consistency:
             rms = math.sqrt(tally.change_squared / max(tally.valid_results, 1))
-            figures["consistency step"] = measured(
-                100 * rms,
-                "% of full scale",
-                "root mean square of what the step added to the known pixels",
-            )
+            how = "root mean square of what the step added to the known pixels"
+            figures["consistency step"] = measured(100 * rms, "% of full scale", how)
         return figures
 
 

@@ -156,9 +156,7 @@ class Node:
 
     @property
     def output_padding(self) -> Sequence[int]:
-        """The numbers of rows and columns that a transposed convolution adds at the end of its
-        result.
-        """
+        """The rows and columns that a transposed convolution adds at the end of its result."""
         return self.attributes.get("output_padding", (0, 0))  # type: ignore[no-any-return]
 
 
