@@ -3,7 +3,7 @@ them.
 
 1. Set the free sizes of the image to numbers, so that the runtime folds arithmetic on shapes.
 2. Write a Resize to a size as one by factors, pads in place of auto_pad SAME, and what only moves
-   and repeats values as one operator (5, 6). Remove a Pad by nothing, a Slice of the
+   and repeats values as one operator (`rearrangements`). Remove a Pad by nothing, a Slice of the
    whole map, and an Expand that arithmetic does anyway. Let a convolution repeat a channel, and
    write a map of one number per channel, such as a noise level.
 3. Do both for two sizes. If the networks are equal, the size has no effect, and theirs is the
@@ -12,20 +12,11 @@ them.
 4. Free a fixed height and width that differ, which no tile has, if they have no effect.
 
 Exporters write such arithmetic for a U-Net that pads or enlarges to the size of its skips, for
-`chunk`, and for a number that is repeated over the image. They spell shuffles of channels, pixel
-unshuffles and repeated channels or pixels by Reshape, Transpose, Expand and Tile, and selected
-channels by GatherND between two Transposes. Such a chain is tested on a map of numbered values:
-
-5. If each channel of the result is a channel of the map, or one place of its blocks of r x r
-   pixels, it is a convolution of r x r pixels and stride r that selects them. A pixel unshuffle of
-   one channel is a SpaceToDepth. ONNX orders several channels in another way, and the host
-   unshuffles an image of several channels.
-6. If each pixel becomes a block, it is a nearest Resize.
+`chunk`, and for a number that is repeated over the image.
 
 All of it is exact.
 """
 
-import math
 from collections.abc import Callable
 from copy import deepcopy
 
@@ -36,6 +27,13 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Rewriting, sizes_of
 from beers_deploy.quant.onnx.image_input import without_size
 from beers_deploy.quant.simplify.fold_affine import affine_chain
+from beers_deploy.quant.simplify.rearrangements import (
+    OF_BLOCKS,
+    RESHAPING,
+    is_rearrangement,
+    rearranged,
+    takes_others,
+)
 
 MULTIPLE_PX = 64
 """Six levels of a U-Net halve sides of this length without a remainder."""
@@ -49,19 +47,6 @@ LOCAL = {
     *("Sigmoid", "SpaceToDepth", "Sub", "Tanh"),
 }
 """Operators that do the same at every pixel, for images of all sizes."""
-RESHAPING = {"Flatten", "Reshape", "Squeeze", "Unsqueeze"}
-"""Operators that move no value."""
-MOVING = RESHAPING | {"Expand", "GatherND", "Tile", "Transpose"}
-PIXEL_SHUFFLES = [0, 1, 4, 2, 5, 3], [0, 3, 4, 1, 5, 2]
-"""The transpositions of enlarging pixel shuffles, which stay."""
-OF_BLOCKS = {
-    "mode": "nearest",
-    "coordinate_transformation_mode": "asymmetric",
-    "nearest_mode": "floor",
-}
-"""Attributes of a Resize that makes a block of each pixel."""
-MOST_VALUES = 1 << 24
-"""The largest map that chains are tested on."""
 Fold = Callable[[ModelProto], ModelProto]
 """A function that folds constants, as onnxruntime does."""
 
@@ -98,7 +83,7 @@ def free_sizes(model: ModelProto, fold: Fold) -> ModelProto:
     constants = {tensor.name for tensor in model.graph.initializer}
     graph = OnnxGraph(model)
     if not any(
-        _is_rearrangement(graph, node)
+        is_rearrangement(graph, node)
         or node.attributes.get("keepdims", 1) == 0
         or _leaves_pads(node)
         or (node.op_type in SIZED and (node.op_type != "Concat" or constants & {*node.inputs}))
@@ -166,8 +151,9 @@ def _sized(graph: OnnxGraph, node: Node) -> list[Node] | None:
     source = node.source
     before = graph.shapes.get(source, ())
     after = graph.shapes.get(node.result, ())
-    if node.op_type == "Transpose" or (node.op_type in RESHAPING and before != after):
-        return _with_kept_axis(graph, node) or _rearranged(graph, node)
+    moves = node.op_type == "Transpose" or takes_others(graph, node)
+    if moves or (node.op_type in RESHAPING and before != after):
+        return _with_kept_axis(graph, node) or rearranged(graph, node)
     if len(before) != 4 or len(after) != 4 or min(*before, *after) < 1:
         return None
     if node.op_type in SPECIAL:
@@ -290,15 +276,6 @@ SPECIAL: dict[str, Rewriting] = {
 """The function for each operator that returns the nodes which replace one."""
 
 
-def _is_rearrangement(graph: OnnxGraph, node: Node) -> bool:
-    """Return True if a node may belong to a chain that moves values, behind the image."""
-    perm = node.attributes.get("perm", ())
-    is_one = len(perm) > 4 and perm not in PIXEL_SHUFFLES
-    return node.op_type in ("GatherND", "Tile") or (
-        is_one and _chain(graph, node)[0] not in graph.inputs
-    )
-
-
 def _with_kept_axis(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Return the mean of a map over its channels, times a constant, in place of one that drops the
     axis, which a Reshape adds again, as torch writes a variance; None if the node is no such
@@ -318,80 +295,3 @@ def _with_kept_axis(graph: OnnxGraph, node: Node) -> list[Node] | None:
         Node.new("ReduceMean", mean.inputs, mean_name, **{**mean.attributes, "keepdims": 1}),
         node.replaced_by("Mul", [mean_name, factor]),
     ]
-
-
-def _rearranged(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Return the operator that does what a node and those in front of it do together.
-
-    Args:
-        graph: the graph that the node belongs to; its constants are extended.
-        node: a Transpose, a Reshape, or another operator that moves no value.
-
-    Returns:
-        The operator; None if there is none for them.
-    """
-    source, chain = _chain(graph, node)
-    before = graph.shapes.get(source, ())
-    result = node.result
-    after = graph.shapes.get(result, ())
-    if len(before) != 4 or len(after) != 4 or not 0 < math.prod(before) <= MOST_VALUES:
-        return None
-    image = np.arange(math.prod(before)).reshape(before)
-    moved = image
-    for each in chain:
-        moved = _moved(graph, moved, each, graph.shapes[each.result])
-    if after[2] > before[2]:
-        return _enlarged(graph, node, source, image, moved)
-    block = before[2] // after[2]
-    channels = before[1]
-    if (after[2] * block, after[3] * block) != before[2:]:
-        return None
-    blocks = image.reshape(-1, channels, after[2], block, after[3], block)
-    blocks = blocks.transpose(0, 1, 3, 5, 2, 4).reshape(before[0], -1, *after[2:])
-    # The numbers grow from channel to channel, and from place to place.
-    order = np.searchsorted(blocks[0, :, 0, 0], moved[0, :, 0, 0]) % blocks.shape[1]
-    if not np.array_equal(blocks[:, order], moved):
-        return None
-    if block > 1 and np.array_equal(order, np.arange(block * block)):
-        return [node.replaced_by("SpaceToDepth", [source], blocksize=block)]
-    if block > 1 and source in graph.inputs:
-        return None
-    weight = np.eye(blocks.shape[1])[order].reshape(-1, channels, block, block)
-    return [graph.convolution(source, result, node.name, weight, strides=[block, block])]
-
-
-def _enlarged(
-    graph: OnnxGraph, node: Node, source: str, image: np.ndarray, moved: np.ndarray
-) -> list[Node] | None:
-    """Return the Resize that moves the numbers of a map so; None if it is no enlargement (6)."""
-    factor = moved.shape[2] // image.shape[2]
-    if not np.array_equal(moved, image.repeat(factor, 2).repeat(factor, 3)):
-        return None
-    scales = graph.add_constant(f"{node.result}.scales", np.array([1, 1, factor, factor]))
-    return [node.replaced_by("Resize", [source, "", scales], **OF_BLOCKS)]
-
-
-def _chain(graph: OnnxGraph, node: Node) -> tuple[str, list[Node]]:
-    """Return the tensor that a chain up to this node begins with, and its nodes in order."""
-    chain = [node]
-    writer = graph.sole_writer(node.source)
-    while writer is not None and writer.op_type in MOVING:
-        chain.insert(0, writer)
-        writer = graph.sole_writer(writer.source)
-    return chain[0].source, chain
-
-
-def _moved(graph: OnnxGraph, values: np.ndarray, node: Node, size: tuple[int, ...]) -> np.ndarray:
-    """Return the result of a node of this size."""
-    if node.op_type == "Transpose":
-        return values.transpose(node.attributes.get("perm"))
-    if node.op_type == "Expand":
-        return np.broadcast_to(values, size)
-    if node.op_type == "Tile":
-        return np.tile(values, np.floor_divide(size, values.shape))
-    if node.op_type == "GatherND":
-        chosen = graph.value(node, 1)
-        is_of_first_axis = chosen is not None and chosen.ndim == 2 and chosen.shape[1] == 1
-        # A number that no map has.
-        return values[chosen[:, 0]] if is_of_first_axis else np.full(size, -1)  # type: ignore[index]
-    return values.reshape(size)

@@ -196,7 +196,9 @@ class Enlarged(nn.Module):
 
 
 class Selected(nn.Module):
-    """A network that reorders channels, and scales them by their mean over the image."""
+    """A network that reorders channels, and scales them by their mean over the image and by one of
+    them. Its maps lie in memory with the channels last.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -205,15 +207,18 @@ class Selected(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """Map images (1, 1, H, W) to the same shape."""
-        wide: Tensor = self.wide(image)[:, [3, 1, 0, 2]]
-        mean = functional.interpolate(wide.mean((2, 3), keepdim=True), wide.shape[2:])
-        result: Tensor = self.tail(wide * mean)
+        wide = self.wide(image).contiguous(memory_format=torch.channels_last)
+        ordered: Tensor = wide[:, [3, 1, 0, 2]]
+        mean = functional.interpolate(functional.adaptive_avg_pool2d(wide, 1), wide.shape[2:])
+        result: Tensor = self.tail(ordered * mean * wide[:, 2].unsqueeze(1) * wide[:, [1]])
         return result
 
 
 @pytest.mark.slow
 def test_torchs_newer_exporter_selects_channels_in_another_way(tmp_path: Path) -> None:
-    """It writes GatherND between two Transposes, and a mean that onnx converts incompletely."""
+    """It writes GatherND between two Transposes, a mean that onnx converts incompletely, and a
+    Gather of the flat mean.
+    """
     image = torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(0))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
