@@ -317,18 +317,17 @@ def structure_checks(
     if (core := _own_core(int8)) is not None:
         # `quant.adapt` computes LeakyReLUs and PReLUs by a ReLU in a second branch, a Tanh by a
         # ReLU6, a standard deviation by a ReLU, and a normalisation by two. They are those of the
-        # float network less the LeakyReLUs of the integers, the Tanh of the host and those behind a
-        # Softplus, which are parts of Mish.
+        # float network less the LeakyReLUs of the integers.
         kinds = Counter(node.op_type for node in float_model.graph.node)
-        float_relus += kinds["LeakyRelu"] + kinds["PRelu"] + kinds["Tanh"] - kinds["Softplus"]
         replaced = nodes_by_kind(OnnxGraph(float_model))
+        float_relus += kinds["LeakyRelu"] + kinds["PRelu"]
+        float_relus += len(replaced.get(Kind.tanh, ()))
         float_relus += len(replaced.get(Kind.deviation, ()))
         float_relus += 2 * len(replaced.get(Kind.normalization, ()))
         float_relus -= sum(
             isinstance(op, IntConv | Pointwise) and op.activation is Activation.leaky_relu
             for op in core.ops
         )
-        float_relus -= core.host_part.activation == "Tanh"
     detail = f"{float_relus} in float, {int8_relus} in INT8"
     faults = encoding_faults(int8)
     checks = [

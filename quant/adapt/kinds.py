@@ -86,6 +86,8 @@ def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
             return kind
     if node.op_type in ("Sigmoid", "Tanh"):
         readers = graph.readers[node.result]
+        if len(readers) == 1 and gelu_gate_input(graph, readers[0].result):
+            readers = graph.readers[readers[0].result]
         part_of_silu = readers and all(silu_input(graph, reader) for reader in readers)
         return None if part_of_silu else Kind[node.op_type.lower()]
     if node.op_type == "HardSigmoid":
@@ -103,8 +105,8 @@ def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
 def silu_input(graph: OnnxGraph, node: Node) -> str:
     """Return the tensor x if a node completes an activation that HardSwish approximates.
 
-    That is a GELU or Mish of x, or x * Sigmoid(c x) with a constant c: 1 for SiLU, 1.702 for the
-    quick GELU.
+    That is a GELU, by Erf or Tanh, or Mish of x, or x * Sigmoid(c x) with a constant c: 1 for SiLU,
+    1.702 for the quick GELU.
 
     Args:
         graph: the graph that the node belongs to.
@@ -121,9 +123,6 @@ def silu_input(graph: OnnxGraph, node: Node) -> str:
             if gelu and other_operand(graph, graph.writers.get(source), "Mul", 0.5) == gelu:
                 return gelu
             before = graph.writers.get(gate)
-            halved = other_operand(graph, before, "Mul", 0.5)
-            if halved and gelu_gate_input(graph, halved) == source:
-                return source
             if before is not None and _is_gate(graph, before, source):
                 return source
     return ""

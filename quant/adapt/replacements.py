@@ -4,7 +4,7 @@ By another function:
 
 1. x * Sigmoid(x), SiLU, becomes HardSwish; so do x * Sigmoid(c x), the quick GELU, and
    x * (1 + Erf(x / sqrt(2))) / 2, the GELU, which differs from it by 0.02 at most for c = 1.702,
-   and x * Tanh(Softplus(x)), Mish.
+   and x * Tanh(Softplus(x)), Mish. The approximation of the GELU by Tanh is another spelling.
 2. Another Sigmoid becomes HardSigmoid, and a Tanh a line of slope `TANH_SLOPE` that is clipped at
    -1 and 1, as ReLU6 of a scaled and shifted input.
 3. LeakyReLU of another slope, and PReLU, become LeakyReLU of 26/256.

@@ -4,12 +4,13 @@
 2. A shift by 3, a clip from 0 to 6 and a sixth are HardSigmoid. They are HardSwish if they are
    multiplied by the tensor itself, in any order.
 3. (Tanh(x) + 1) / 2 is Sigmoid(2 x).
-4. GELU, x (1 + Erf(x / sqrt(2))) / 2, stays spelled out, but its half comes first. Behind the
-   product it would be folded into the next convolution, and nobody would recognise the rest.
+4. GELU, x (1 + Erf(x / sqrt(2))) / 2 or x (1 + Tanh(sqrt(2 / pi) (x + 0.044715 x^3))) / 2, stays
+   spelled out, but its half comes first. Behind the product it would be folded into the next
+   convolution, and in front of it be a part of a Sigmoid, and nobody would recognise the rest.
 """
 
 from collections.abc import Callable
-from math import sqrt
+from math import pi, sqrt
 
 import numpy as np
 
@@ -145,45 +146,73 @@ def join_sigmoid(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
 
 def halve_before_gelu(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Move the factor 1/2 of a GELU, x (1 + Erf(x / sqrt(2))) / 2, in front of the product (point 4
-    of the module).
+    """Move the factor 1/2 of a GELU in front of its product (point 4 of the module).
 
     Args:
         graph: the graph that the node belongs to.
-        node: any node; only the multiplication by 1/2 is replaced.
+        node: any node; only the last multiplication is replaced.
 
     Returns:
         x / 2, and the product that completes the GELU; None if the node stays.
     """
-    product = graph.sole_writer(other_operand(graph, node, "Mul", 0.5) or "")
-    if product is None or product.op_type != "Mul":
-        return None
-    for source, gate in (product.inputs, product.inputs[::-1]):
-        if gelu_gate_input(graph, gate) == source:
-            (half,) = (name for name in node.inputs if name in graph.constants)
-            halved = f"{product.result}.half"
-            return [
-                Node.new("Mul", [source, half], halved),
-                node.replaced_by("Mul", [halved, gate]),
-            ]
+    for inner, outer in (node.inputs, node.inputs[::-1]) if node.op_type == "Mul" else ():
+        product = graph.sole_writer(inner)
+        if product is None or product.op_type != "Mul":
+            continue
+        # Either the half is multiplied last, or the tensor itself.
+        for gate, other in (product.inputs, product.inputs[::-1]):
+            source = gelu_gate_input(graph, gate)
+            halves = {name for name in (other, outer) if _is_number(graph, name, 0.5)}
+            if source and halves and {other, outer} == {source, *halves}:
+                halved = f"{inner}.half"
+                return [
+                    Node.new("Mul", [source, *halves], halved),
+                    node.replaced_by("Mul", [halved, gate]),
+                ]
     return None
 
 
 def gelu_gate_input(graph: OnnxGraph, name: str) -> str | None:
-    """Return the name of x if a tensor is 1 + Erf(x / sqrt(2)), the factor of x in a GELU; else
-    None.
+    """Return the name of x if a tensor is the factor of x in a GELU, without its half: 1 + Erf(x /
+    sqrt(2)), or 1 + Tanh(sqrt(2 / pi) (x + 0.044715 x^3)); else None.
 
     Args:
         graph: the graph that the tensor belongs to.
         name: the name of the tensor.
     """
-    erf = graph.writers.get(other_operand(graph, graph.writers.get(name), "Add", 1) or "")
-    if erf is None or erf.op_type != "Erf":
+    function = graph.writers.get(other_operand(graph, graph.writers.get(name), "Add", 1) or "")
+    if function is None or function.op_type not in ("Erf", "Tanh"):
         return None
-    scaled = graph.writers.get(erf.source)
+    scaled = graph.writers.get(function.source)
+    if function.op_type == "Tanh":
+        return _cubic_input(graph, scaled)
     # Exporters divide by sqrt(2), or multiply by its reciprocal.
     by_factor = other_operand(graph, scaled, "Mul", sqrt(0.5))
     return by_factor or other_operand(graph, scaled, "Div", sqrt(2))
+
+
+def _cubic_input(graph: OnnxGraph, node: Node | None) -> str | None:
+    """Return x if a node computes sqrt(2 / pi) (x + 0.044715 x^3)."""
+    total = graph.writers.get(other_operand(graph, node, "Mul", sqrt(2 / pi)) or "")
+    if total is None or total.op_type != "Add":
+        return None
+    for source, scaled in (total.inputs, total.inputs[::-1]):
+        cube = other_operand(graph, graph.writers.get(scaled), "Mul", 0.044715)
+        factors = _factors(graph, cube) if cube else []
+        if len(factors) == 3 and set(factors) == {source}:
+            return source
+    return None
+
+
+def _factors(graph: OnnxGraph, name: str) -> list[str]:
+    """Return the tensors whose product a tensor is; itself if it is no product."""
+    node = graph.writers.get(name)
+    if node is None or node.op_type != "Mul":
+        return [name]
+    factors = []
+    for factor in node.inputs:
+        factors += _factors(graph, factor)
+    return factors
 
 
 def _gated_by(
@@ -230,10 +259,16 @@ def other_operand(graph: OnnxGraph, node: Node | None, kind: str, number: float)
     """
     if node is not None and node.op_type == kind and len(node.inputs) == 2:
         for place in (0, 1)[: 1 if kind == "Div" else 2]:
-            constant = _scalar(graph, node, 1 - place)
-            if constant is not None and np.isclose(constant, number, rtol=1e-6, atol=0):
+            if _is_number(graph, node.inputs[1 - place], number):
                 return node.inputs[place]
     return None
+
+
+def _is_number(graph: OnnxGraph, name: str, number: float) -> bool:
+    """Return True if a tensor is a constant of this one number, up to the rounding of float32."""
+    value = graph.constants.get(name)
+    is_float = value is not None and value.size == 1 and value.dtype.kind == "f"
+    return is_float and bool(np.isclose(value.item(), number, rtol=1e-6, atol=0))
 
 
 def _scalar(graph: OnnxGraph, node: Node, place: int) -> float | None:

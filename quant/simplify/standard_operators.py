@@ -115,19 +115,26 @@ def choose_by_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
 
 def replace_powers(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace the square of a map by its product with itself, and a power of 0.5 by the root.
+    """Replace the square and the cube of a map by its products with itself, and a power of 0.5 by
+    the root.
 
     Args:
         graph: the graph that the node belongs to.
         node: any node.
 
     Returns:
-        The product or the root; None if the node is neither power.
+        The products or the root; None if the node is no such power.
     """
     exponent = graph.value(node, 1) if node.op_type == "Pow" else None
     power = exponent.item() if exponent is not None and exponent.size == 1 else None
     if power == 2:
         return [node.replaced_by("Mul", [node.source] * 2)]
+    if power == 3:
+        square = f"{node.result}.square"
+        return [
+            Node.new("Mul", [node.source] * 2, square),
+            node.replaced_by("Mul", [square, node.source]),
+        ]
     return [node.replaced_by("Sqrt", [node.source])] if power == 0.5 else None
 
 

@@ -91,6 +91,32 @@ def halved_gelu(w: GraphWriter, x: str, name: str) -> str:
     return w.node("Mul", name, [x, w.node("Mul", f"{name}.half", [half, gate])])
 
 
+def tanh_gelu(half_first: bool) -> Act:
+    """Return the GELU of Tanh: torch multiplies the half last, or first, by hand."""
+
+    def write(w: GraphWriter, x: str, name: str) -> str:
+        """Write the operators in the order of the exporter."""
+        half, one, three, small, root = (
+            w.constant(key, np.array(value, np.float32))
+            for key, value in {
+                "half": 0.5,
+                "one": 1,
+                "three": 3,
+                "small": 0.044715,
+                "root": (2 / np.pi) ** 0.5,
+            }.items()
+        )
+        cube = w.node("Pow", f"{name}.cube", [x, three])
+        total = w.node("Add", f"{name}.sum", [x, w.node("Mul", f"{name}.small", [small, cube])])
+        tanh = w.node("Tanh", f"{name}.tanh", [w.node("Mul", f"{name}.scaled", [root, total])])
+        gate = w.node("Add", f"{name}.gate", [tanh, one])
+        if half_first:
+            return w.node("Mul", name, [w.node("Mul", f"{name}.half", [x, half]), gate])
+        return w.node("Mul", name, [half, w.node("Mul", f"{name}.both", [x, gate])])
+
+    return write
+
+
 def tanh(w: GraphWriter, x: str, name: str) -> str:
     return w.node("Tanh", name, [x])
 
@@ -324,6 +350,8 @@ REPLACED = {
     "GELU, multiplied": (gelu(divides=False), Kind.silu, 3),
     "Sigmoid": (gated, Kind.sigmoid, 3),
     "GELU, halved in the gate": (halved_gelu, Kind.silu, 3),
+    "GELU of Tanh": (tanh_gelu(half_first=False), Kind.silu, 3),
+    "GELU of Tanh, half first": (tanh_gelu(half_first=True), Kind.silu, 3),
     "Mish": (mish, Kind.silu, 3),
     "Tanh": (tanh, Kind.tanh, 3),
     "LeakyReLU": (leaky(0.2), Kind.leaky_relu, 3),
