@@ -51,6 +51,7 @@ from beers_deploy.quant.simplify.activations_first import (
     activations_first,
     behind_convolutions,
 )
+from beers_deploy.quant.simplify.branches import JoinBranches
 from beers_deploy.quant.simplify.channels import (
     broadcasts_channels,
     join_copies,
@@ -168,6 +169,7 @@ def _run_passes(model: ModelProto) -> None:
     graph = OnnxGraph(model)
     graph.shapes = float_shapes(graph)
     for replacement in (
+        JoinBranches(),
         clip_last,
         split_soft_threshold,
         choose_by_relu,

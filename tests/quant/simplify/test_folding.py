@@ -51,6 +51,30 @@ def test_operators_of_exporters_are_folded_and_compute_the_same(case: str) -> No
     assert folded(network_from(nodes)) == remaining
 
 
+@pytest.mark.parametrize(
+    ("nodes", "remaining"),
+    [
+        (
+            """n = Unsqueeze(c, one_int) o = Unsqueeze(x, one_int) s = Concat<axis=1>(n, o)
+            p = Softmax<axis=1>(s) g = Gather<axis=1>(p, first) h = Gather<axis=1>(p, second)
+            k = Mul(c, g) m = Mul(x, h) y = Add(k, m)""",
+            {"Conv": 3, "Sigmoid": 2, "Mul": 2, "Add": 1, "Concat": 1},
+        ),
+        (
+            """s = Reshape(c, of_two) p = Softmax<axis=-4>(s) m = Mul(s, p)
+            y = ReduceSum<keepdims=0>(m, one_int)""",
+            {"Conv": 3, "Sigmoid": 1, "Mul": 1},
+        ),
+    ],
+)
+def test_branches_with_an_axis_of_their_own_are_channels(
+    nodes: str, remaining: dict[str, int]
+) -> None:
+    """SKNet selects the branches that it chooses among, and MIRNet adds them up."""
+    ends = "float[2,4,9,11] x => float[N,C,H,W] y"
+    assert folded(network_from(f"{CONV} {nodes}", ends=ends)) == remaining
+
+
 CONVOLUTIONS = {"Conv", "ConvTranspose"}
 PARTS = {
     "convolution": "Conv<pads=[1,1,1,1]>({}, w)",
