@@ -4,7 +4,7 @@
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -109,11 +109,17 @@ COMPUTED = (
 )
 """Operators whose results are computed if they are short lists of numbers."""
 
+REDUCING = {"ReduceL2", "ReduceMean", "ReduceSum"}
+NORMALIZING = REDUCING | {"Add", "Div", "MatMul", "Mul", "Pow", "Sub"}
+"""Operators that torch's older exporter leaves of weights that are normalised, such as by
+weight_norm or spectral_norm.
+"""
+
 
 def _computed(
     node: NodeProto, arrays: Mapping[str, np.ndarray], opset: int, where: str
 ) -> dict[str, np.ndarray]:
-    """Compute the result of a node from short lists; empty if it is no short list of numbers.
+    """Compute the result of a node from short lists or weights; empty if it is neither.
 
     Exporters leave a dozen nodes to state four sizes. onnx's reference in Python computes them
     before a runtime opens the file. The resulting sizes are therefore checked like those that a
@@ -122,7 +128,8 @@ def _computed(
     """
     values = [arrays.get(name) for name in node.input]
     is_short = all(value is not None and value.size <= LIST_VALUES for value in values)
-    if node.op_type in COMPUTED and is_short:
+    is_weight = node.op_type in NORMALIZING and _keeps_size(node.op_type, values)
+    if (node.op_type in COMPUTED and is_short) or is_weight:
         # Importing it takes half a second, which only files that compute sizes should cost.
         from onnx.reference import ReferenceEvaluator
 
@@ -131,7 +138,7 @@ def _computed(
             feeds = dict(zip(node.input, values, strict=True))
             evaluator = ReferenceEvaluator(node, opsets={"": opset})
             result = np.asarray(next(iter(evaluator.run(None, feeds))))
-            if result.dtype.kind in "biuf" and result.size <= LIST_VALUES:
+            if result.dtype.kind in "biuf" and (is_weight or result.size <= LIST_VALUES):
                 return {node.output[0]: result}
     if node.op_type not in KEEPING | FILLING:
         raise ModelError(
@@ -140,6 +147,23 @@ def _computed(
             "(optimized_model_filepath, ORT_ENABLE_BASIC), which folds its constants."
         )
     return {}
+
+
+def _keeps_size(op_type: str, values: Sequence[np.ndarray | None]) -> bool:
+    """Return True if arithmetic of constants gives no more numbers than the largest of them has."""
+    arrays = [value for value in values if value is not None]
+    if len(arrays) < len(values):
+        return False
+    if op_type in REDUCING:
+        return True
+    largest = max(array.size for array in arrays)
+    if op_type == "MatMul":
+        shared = math.prod(arrays[0].shape[-1:]) or 1
+        return math.prod(array.size for array in arrays) <= largest * shared**2
+    # Arrays that do not fit together are none that a runtime would accept.
+    with suppress(ValueError):
+        return np.broadcast(*arrays).size <= largest
+    return False
 
 
 def named(node: NodeProto) -> str:

@@ -133,6 +133,14 @@ REFUSED = [
     ),
     (constant("n", 9, 9) + "y = CumSum(n, n)", "reads constants only"),
     (
+        constant("n", *range(5000)) + constant("r", -1, 1) + "a = Reshape(n, r) b = Mul(a, n)",
+        "Mul b in untrusted.onnx reads constants only",
+    ),
+    (
+        constant("n", *range(5000)) + "a = Unsqueeze(n, n) b = MatMul(a, n)",
+        "MatMul b in untrusted.onnx reads constants only",
+    ),
+    (
         constant("n", 9) + constant("r", 2**20, 2**10) + "y = Expand(n, r)",
         "1048576 x 1024, but a tensor may have at most",
     ),
@@ -176,8 +184,8 @@ def test_nodes_that_could_harm_a_runtime_are_refused(
 
 
 def test_computed_weights_run_once_saved_as_the_message_says(tmp_path: Path) -> None:
-    """The example is a weight normalisation, as torch's older exporter writes it."""
-    nodes = "n = ReduceL2<axes=[1,2,3]>(w) d = Div(w, n) y = Conv<pads=[1,1,1,1]>(image, d)"
+    """The example are positive weights, as torch's older exporter writes them."""
+    nodes = "e = Exp(w) y = Conv<pads=[1,1,1,1]>(image, e)"
     weights = {"w": np.ones((4, 4, 3, 3), np.float32)}
     model = parsed(nodes, "float[N,4,H,W] image => float[N,4,P,Q] y", constants=weights)
     assert "(optimized_model_filepath, ORT_ENABLE_BASIC)" in refusal(model)

@@ -26,6 +26,10 @@ WEIGHTS: dict[str, tuple[int, ...]] = {
     "wide": (24, 5),
     "one_one": (1, 1, 3, 3),
     "taps": (1, 1, 3),
+    "lengths": (4, 1, 1, 1),
+    "matrix": (4, 36),
+    "right": (36,),
+    "left": (4,),
 }
 NUMBERS = {
     "zero": 0.0,
@@ -163,6 +167,21 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         f"""k, l = Split<axis=1>(x, one_three) m = {SAME}(k, one_one) d = Concat<axis=1>(m, l)
         e = {SAME}(d, w) y = Add(e, x)""",
         {"Conv": 3, "Concat": 1, "Add": 1},
+    ),
+    "weights by their norm": (
+        """n = ReduceL2<axes=[1,2,3]>(w) d = Div(w, n) v = Mul(d, lengths)
+        y = Conv<pads=[1,1,1,1]>(x, v)""",
+        {"Conv": 1},
+    ),
+    "weights without their mean": (
+        """n = ReduceMean<axes=[1,2,3]>(w) d = Sub(w, n) s = Mul(d, d) t = ReduceSum(s) r = Sqrt(t)
+        v = Div(d, r) y = Conv<pads=[1,1,1,1]>(x, v)""",
+        {"Conv": 1},
+    ),
+    "weights by their spectral norm": (
+        """m = MatMul(matrix, right) s = MatMul(left, m) v = Div(w, s)
+        y = Conv<pads=[1,1,1,1]>(x, v)""",
+        {"Conv": 1},
     ),
     "the negative of a map": (
         f"{CONV} n = Neg(x) m = Neg(c) a = Add(n, m) y = Mul(a, x)",
