@@ -267,8 +267,9 @@ def other_operand(graph: OnnxGraph, node: Node | None, kind: str, number: float)
 def _is_number(graph: OnnxGraph, name: str, number: float) -> bool:
     """Return True if a tensor is a constant of this one number, up to the rounding of float32."""
     value = graph.constants.get(name)
-    is_float = value is not None and value.size == 1 and value.dtype.kind == "f"
-    return is_float and bool(np.isclose(value.item(), number, rtol=1e-6, atol=0))
+    if value is None or value.size != 1 or value.dtype.kind != "f":
+        return False
+    return bool(np.isclose(value.item(), number, rtol=1e-6, atol=0))
 
 
 def _scalar(graph: OnnxGraph, node: Node, place: int) -> float | None:
