@@ -6,11 +6,14 @@ values, and write files only where they are given an output; each is a command t
 
 - `verbs`: one verb a file: signature and docstring are those of the library, the command and its
   help; `cli` makes the commands;
-- `network`: a network as a value; `quantization`, `comparison`, `verdict`, `pairs`: the steps of
-  the verbs; `kit`: what a board's engineer gets;
+- `network`: a network as a value; `network_files`, `conditioned_file`: its file, by its name and
+  for its sensor; `float_onnx`, `onnx_export`, `parity`: written as ONNX, and compared;
+- `quantization`, `comparison`, `verdict`, `pairs`: the steps of the verbs; `kit`: what a board's
+  engineer gets;
 - `restoration`: images of any size through a network or the traditional pipeline;
 - `dpu`: the checker of operators and the cost model; `performance`: times, predicted and measured;
 - `results`: figures as one table, JSON document and page; `tables` and `report` show them;
+  `shipped_tables`: the shipped data as tables;
 - `studies`: long-running work: evaluation, trade-off, stress, detection, a sensor from its images,
   and the recipes that make the shipped networks.
 """

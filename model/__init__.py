@@ -8,10 +8,12 @@ It imports `profiles` and nothing else of this project.
   without training;
 - `dataset`: pairs on disk, and the sensors and scenes that made them; `training`: runs that produce
   weights;
-- `consistency`: makes a restored image consistent with the raw one;
-- `metrics`: the quality of a restored image;
-- `io`: images and tensors on disk; `shipped`: the location of the shipped weights; `processor`: the
-  behaviour of this machine's kernels;
+- `exposure`: brightens dark parts for a network; `consistency`: makes a restored image consistent
+  with the raw one; `self_check`: checks that; `interval`: the likely error of each pixel;
+- `metrics`: the quality of a restored image; `departure`: how a sensor's MTF differs from those
+  that networks were trained on;
+- `raster`: images on disk; `io`: other files; `shipped`: the location of the shipped weights;
+  `variants`: their sizes; `processor`: the behaviour of this machine's kernels;
 - `progress`: progress reports of long work, and how Ctrl-C stops it.
 
 It exports no names itself, so that finding a file or reading an image does not load torch.

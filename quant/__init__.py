@@ -10,6 +10,10 @@ float ONNX (`onnx_file`) -> `graph` -> `samples` -> `passes` -> integer `core` -
   error of each layer;
 - `tiling` determines how an image may be cut into tiles for a network: lattice, halo and scale;
   `samples` are simulated patches or a user's own;
+- `sensor_bank` makes one file for every sensor; `host_part` is what the host computes; `adapt`
+  replaces operators that a DPU lacks;
+- `plan` holds the steps of a quantisation, and `price` measures what each restriction costs;
+- `c_code` writes the core as C;
 - `onnx` represents the one graph of a file, `simplify` folds what exporters leave in a float one,
   and `untrusted` checks files before they are used.
 """

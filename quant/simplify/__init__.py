@@ -7,6 +7,6 @@
 - `channels_first`, `free_sizes`, `missing_border`: passes on the image of a network: the order of
   its axes, arithmetic on its size, and the border that a network without padding lacks;
 - `rearrangements`: what only moves values, as one operator;
-- `activations_first`: what must follow a convolution does;
+- `activations_first`: moves activations directly behind their convolutions;
 - `training_mode`: rejects networks that were exported in training mode.
 """
