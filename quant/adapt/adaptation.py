@@ -42,14 +42,14 @@ FIT_IMAGES = 32
 FIT_PX = 48
 """The maximum number of images, and their side in pixels, on which convolutions are fitted."""
 FEWEST_FIT_IMAGES = 4
-"""Of images of a larger fixed size as few are used as have the same number of pixels, but not fewer
-than these, because each fit runs the network on all of them.
+"""The minimum number. A network of a larger fixed size is fitted on fewer images, with as many
+pixels in all, because each fit runs it on all of them.
 """
 
 
 @dataclass(frozen=True)
 class Adapted:
-    """A float network whose operators a DPU computes, and the loss of replacing others by them.
+    """A float network whose operators a DPU computes, and the loss by the replacement of others.
 
     Attributes:
         model: the network.
@@ -135,7 +135,7 @@ def adapt(model: onnx.ModelProto, samples: Patches, held_out: Patches) -> Adapte
         trials[kind] = _trial(model, {kind}, set(), images, held_out, inverses)
         if kind in EXACT and not trials[kind].is_enough:
             exact.add(kind)
-    # 3. One kind alone has been tried as it is chosen.
+    # 3. If there is only one kind, its trial in 1. is already the result.
     if len(counts) == 1 and not exact:
         (chosen,) = trials.values()
     else:
@@ -175,7 +175,8 @@ def _trial(
     changed = [node.outputs[0] for node in approximations]
     fitted = compensated(model, network, changed, images)
     after = compare(session, open_any_size(fitted), held_out)
-    # Not by the references: another network may gain on a few samples by chance.
+    # Compared with the original, not with the references: a change may gain by chance on few
+    # samples.
     if after.psnr_between_db < before.psnr_between_db:
         return Trial(network, before, before)
     return Trial(fitted, before, after)
@@ -189,7 +190,7 @@ def _fit_images(model: onnx.ModelProto, images: Sequence[np.ndarray]) -> list[np
         try:
             alignment_px = tiling_of(model).alignment_px
         except ModelError:
-            # The operator that is to be replaced may be none that can be tiled.
+            # Perhaps an operator that is to be replaced prevents tiling.
             alignment_px = FIT_PX
         side_px = -(-FIT_PX // alignment_px) * alignment_px
     else:

@@ -26,13 +26,14 @@ from beers_deploy.quant.session import open_any_size, tensors_of, with_outputs
 from beers_deploy.quant.simplify.fold_affine import is_convolution
 
 MOST_UNKNOWNS = 2304
-"""The maximum number of weights of one result, as of 256 channels and 3 x 3. The equations of more
-take too long.
+"""A convolution is fitted if each output channel has at most this many weights, as with 3 x 3
+pixels of 256 channels. With more, solving the equations takes too long.
 """
-ROWS_OF_EACH_UNKNOWN = 16
-LEAST_ROWS = 8192
-LEAST_ROWS_OF_EACH = 8
-"""The least number of results for each unknown weight; fewer would overfit the samples."""
+PIXELS_OF_EACH_UNKNOWN = 16
+LEAST_PIXELS = 8192
+"""Equations are taken at this many pixels for each weight, and at LEAST_PIXELS if that is more."""
+LEAST_PIXELS_OF_EACH_UNKNOWN = 8
+"""If maps have fewer pixels for each weight, only the bias is fitted; weights would overfit."""
 RIDGE = 1e-5
 """The penalty on changing the weights, relative to the mean square of a convolution's input."""
 FACTORS = np.geomspace(0.6, 3.6, 31)
@@ -160,10 +161,10 @@ def _targets(networks: Networks, nodes: Sequence[Node]) -> list[list[Target]]:
     outputs = [node.outputs[0] for node in nodes]
     for maps in values_of(networks.original, outputs, networks.images):
         for target, values, count in zip(targets, maps, unknowns, strict=True):
-            total = max(LEAST_ROWS, ROWS_OF_EACH_UNKNOWN * count)
+            total = max(LEAST_PIXELS, PIXELS_OF_EACH_UNKNOWN * count)
             height, width = values.shape[2:]
-            n_rows = min(-(-total // len(networks.images)), height * width)
-            places = generator.integers(0, height * width, n_rows)
+            n_pixels = min(-(-total // len(networks.images)), height * width)
+            places = generator.integers(0, height * width, n_pixels)
             rows, columns = np.unravel_index(places, (height, width))
             target.append(Target(rows, columns, values[0][:, rows, columns].T))
     return targets
@@ -187,9 +188,9 @@ def _scale_activations(networks: Networks, replaced: Sequence[Node]) -> dict[str
         before = networks.graph.writers[node.inputs[0]]
         weight, bias = networks.weights(before)
         networks.set_weights(before, weight * best[:, None, None, None], bias * best)
-        for reader in (
-            networks.graph.readers[node.outputs[0]] if node.op_type == "HardSwish" else ()
-        ):
+        if node.op_type != "HardSwish":
+            continue
+        for reader in networks.graph.readers[node.outputs[0]]:
             weight, bias = networks.weights(reader)
             # Depthwise convolutions and those of groups read only their own group's channels.
             shape = (reader.attributes.get("group", 1), 1, -1, 1, 1)
@@ -206,7 +207,7 @@ def _may_scale(networks: Networks, node: Node) -> bool:
         return False
     (output,) = node.outputs
     behind = all(networks.is_conv(reader) for reader in graph.readers[output])
-    # HardSigmoid has its k in front alone.
+    # A HardSigmoid is only scaled in front.
     is_alone = node.op_type == "HardSwish" and behind and output not in graph.outputs
     return is_alone or node.op_type == "HardSigmoid"
 
@@ -220,7 +221,8 @@ def _best_factors(is_swish: bool, source: np.ndarray, result: np.ndarray) -> np.
         candidate = np.clip(scaled / 6 + 0.5, 0, 1) * (scaled if is_swish else 1)
         candidate = candidate - candidate.mean(1, keepdims=True)
         variance = np.maximum(np.square(candidate).mean(1), np.finfo(np.float32).tiny)
-        # What a line through the candidate explains; only that part depends on k.
+        # The part of the variance that a line through the candidate explains; the rest is the same
+        # for every k.
         residuals.append(-np.square((candidate * centred).mean(1)) / variance)
     return np.asarray(FACTORS[np.argmin(residuals, axis=0)], np.float32)
 
@@ -231,9 +233,9 @@ def _fit(
     """Solve the normal equations of a convolution, group by group.
 
     Args:
-        networks: both.
-        node: the convolution of the adapted one.
-        targets: its results in the original one, for each image.
+        networks: both networks.
+        node: the convolution, in the adapted network.
+        targets: its results in the original network, for each image.
         factors: k (O,) of its results, None for 1.
     """
     weight, bias = networks.weights(node)
@@ -281,7 +283,7 @@ class Equations:
 
         Args:
             reads: (K, I, kh, kw) the values that the convolution reads for each pixel.
-            errors: (K, O) the changes of its results that are wanted there.
+            errors: (K, O) the changes that its results need there.
         """
         groups, unknowns, results = self._shape
         x = reads.reshape(-1, groups, unknowns).transpose(1, 2, 0).astype(np.float64)
@@ -296,17 +298,17 @@ class Equations:
         """Return the changes of weights and bias that fit the equations best, with a penalty of
         RIDGE.
 
-        If there are fewer than LEAST_ROWS_OF_EACH equations for each weight, only the bias is
-        changed.
+        If there are fewer than LEAST_PIXELS_OF_EACH_UNKNOWN pixels for each weight, only the bias
+        is changed.
 
         Returns:
             The changes (O, I / groups * kh * kw) of the weights and (O,) of the bias, float64.
         """
         groups, unknowns, results = self._shape
-        if self._count < LEAST_ROWS_OF_EACH * unknowns:
+        if self._count < LEAST_PIXELS_OF_EACH_UNKNOWN * unknowns:
             bias_change = (self._errors / self._count).ravel()
             return np.zeros((groups * results, unknowns)), bias_change
-        # About the means, so that the bias has no penalty.
+        # The means are subtracted, so that the bias has no penalty.
         reads = self._reads / self._count
         errors = self._errors / self._count
         gram = self._gram / self._count - reads @ reads.swapaxes(1, 2)

@@ -22,7 +22,7 @@ KNOTS = 3
 MOST_PIXELS = 20000
 """The maximum number of pixels that a normalisation over channels is fitted to."""
 LEAST_VARIANCE = 1e-12
-"""What is added to variances at least. Without it, maps without contrast would divide by 0."""
+"""The minimum that is added to variances. Without it, maps without contrast would divide by 0."""
 SCALINGS = np.geomspace(0.5, 2, 9)
 """Factors of each image's statistics, so that an image of more or less contrast is fitted, too."""
 
@@ -59,7 +59,7 @@ def _of_pixels(values: np.ndarray, epsilon: float) -> InverseDeviation:
 
     Args:
         values: (N, C, H, W) the map in N images.
-        epsilon: what is added to the variance.
+        epsilon: the number that is added to the variance.
     """
     channels = values.shape[1]
     pixels = np.moveaxis(values, 1, -1).reshape(-1, channels)
@@ -82,7 +82,7 @@ def _of_image(values: np.ndarray, epsilon: float) -> InverseDeviation:
 
     Args:
         values: (N, C, H, W) the map in N images.
-        epsilon: what is added to the variance.
+        epsilon: the number that is added to the variance.
     """
     channels = values.shape[1]
     differences = values - values.mean((2, 3), keepdims=True)
@@ -120,7 +120,7 @@ def _fit(
     Args:
         features: (n, F) of n pixels or images, at least 0.
         variances: (n,).
-        epsilon: what is added to the variance.
+        epsilon: the number that is added to the variance.
 
     Returns:
         The weights (F,) of the features, the knots (KNOTS,) of their sum a, and the heights
@@ -143,8 +143,8 @@ def _fit(
 
 
 def _non_negative(rows: np.ndarray, results: np.ndarray) -> np.ndarray:
-    """Return the solution (F,) of least squares, at least 0, of rows (n, F) for results (n,)."""
-    # Of the triangular factor, because that is several times as fast for hundreds of features.
+    """Return the x (F,), at least 0, for which rows (n, F) @ x is nearest to results (n,)."""
+    # `nnls` gets the triangular factor, which is several times as fast for hundreds of features.
     factor = np.asarray(np.linalg.qr(np.column_stack([rows, results]), mode="r"))
     solution, _ = nnls(factor[:, :-1], factor[:, -1])
     return np.asarray(solution)

@@ -1,6 +1,6 @@
-"""Tell which operators of a float network a DPU lacks, by the kind of what replaces them.
+"""Find the operators of a float network that a DPU lacks and that can be replaced.
 
-The numbers are those of `quant.adapt.replacements`.
+Operators with the same replacement are one kind. `quant.adapt.replacements` lists them by numbers.
 """
 
 from enum import StrEnum
@@ -51,13 +51,13 @@ APPROXIMATIONS = {
     Kind.deviation: "the mean absolute deviation",
     Kind.normalization: "lines through the inverse of a sum of absolute differences",
 }
-"""The other function that replaces each kind (1 to 3, and 6 to 11)."""
+"""The other function that replaces each kind (1 to 9)."""
 EXACT = {
     Kind.hard_sigmoid: "HardSigmoid of a scaled input",
     Kind.leaky_relu: "ReLU in a second branch, and an Add",
     Kind.prelu: "ReLU in a second branch, and an Add",
 }
-"""The exact replacement of each kind (4 and 5)."""
+"""The exact replacement of each kind (10 and 11)."""
 
 
 def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:

@@ -2,36 +2,34 @@
 
 By another function:
 
-1. x * Sigmoid(x), SiLU, becomes HardSwish; so do x * Sigmoid(c x), the quick GELU, and
-   x * (1 + Erf(x / sqrt(2))) / 2, the GELU, which differs from it by 0.02 at most for c = 1.702,
-   and x * Tanh(Softplus(x)), Mish. The approximation of the GELU by Tanh is another spelling.
-2. Another Sigmoid becomes HardSigmoid, and a Tanh a line of slope `TANH_SLOPE` that is clipped at
-   -1 and 1, as ReLU6 of a scaled and shifted input.
+1. Four functions become HardSwish: SiLU, x * Sigmoid(x); the quick GELU, x * Sigmoid(c x); the
+   GELU, x * (1 + Erf(x / sqrt(2))) / 2 or its approximation by Tanh, which differs from the quick
+   one by 0.02 at most if c = 1.702; and Mish, x * Tanh(Softplus(x)).
+2. Any other Sigmoid becomes HardSigmoid. A Tanh becomes a line of slope `TANH_SLOPE` that is
+   clipped at -1 and 1, computed as ReLU6 of a scaled and shifted input.
 3. LeakyReLU of another slope, and PReLU, become LeakyReLU of 26/256.
+
+4. Spatial attention that shrinks and enlarges by no whole factors is aligned with its map
+   (`quant.graph.attention`).
+5. Maps that are padded by reflection or by their edge are padded by zeros. The host mirrors the
+   image beyond its borders and crops the result, so that the zeros lie outside of it.
+6. Bilinear enlargement by a power of two becomes enlargements by 4 and 2 with half-pixel centres.
+   Aligned corners are up to a quarter of a small pixel away.
+7. Bicubic enlargement of the image becomes a transposed convolution with the same weights. Where
+   the original repeats the border of the image, the host mirrors it.
+8. The standard deviation over the image, in IMDN's attention, becomes the mean absolute deviation
+   (`quant.graph.deviation`).
+9. A normalisation of each pixel over its channels, or of each channel over the image, divides by
+   lines through sums of absolute differences (`quant.graph.normalization`).
 
 Exactly, but for the rounding of float32:
 
-4. LeakyReLU and PReLU of slopes s become s x + ReLU((1 - s) x): two branches and an Add. Where s is
-   above 1 the negative of it is computed so, and convolutions behind it are negated.
-5. HardSigmoid of another slope and offset becomes that of 1/6 and 0.5 behind a scaled input.
+10. LeakyReLU and PReLU of slopes s become s x + ReLU((1 - s) x): two branches and an Add. If s is
+    above 1, the branches compute the negative of that, and convolutions behind it are negated.
+11. HardSigmoid of another slope and offset becomes that of 1/6 and 0.5 behind a scaled input.
 
-And by another function again:
-
-6. Spatial attention that shrinks and enlarges by no whole factors is aligned with its map
-   (`quant.graph.attention`).
-7. Maps that are padded by reflection or by their edge are padded by zeros. The host mirrors the
-   image beyond its borders and crops the result, so that the zeros lie outside of it.
-8. Bilinear enlargement by a power of two becomes enlargements by 4 and 2 with half-pixel centres.
-   Aligned corners are up to a quarter of a small pixel away.
-9. Bicubic enlargement of the image becomes a transposed convolution with the same weights. Where
-   the original repeats the border of the image, the host mirrors it.
-10. The standard deviation over the image, in IMDN's attention, becomes the mean absolute deviation
-    (`quant.graph.deviation`).
-11. A normalisation of each pixel over its channels, or of each channel over the image, divides by
-    lines through sums of absolute differences (`quant.graph.normalization`).
-
-ELU, SELU and Softplus stay: lines that bend twice, by two ReLUs, lose 0.4 to 0.8 dB of U-Nets even
-if the convolutions behind are fitted.
+ELU, SELU and Softplus are not replaced: lines that bend twice, by two ReLUs, lose 0.4 to 0.8 dB of
+U-Nets even if the convolutions behind are fitted.
 """
 
 from collections.abc import Collection, Mapping
@@ -62,7 +60,7 @@ from beers_deploy.quant.simplify.fold_affine import (
 from beers_deploy.quant.simplify.standard_operators import float_shapes
 
 TANH_SLOPE = 0.8
-"""Of 0.6 to 1 the slope with the least error for inputs whose deviation is 1 to 2."""
+"""The slope, of 0.6 to 1, with the least error for inputs whose standard deviation is 1 to 2."""
 
 
 def replaced(
@@ -82,8 +80,8 @@ def replaced(
         approximated: the kinds that are replaced by another function, which is near the original.
         exact: the kinds that are replaced by several operators with the same result. A kind in both
             is approximated.
-        inverses: the inverse deviation of each normalisation by the name of its result; one that is
-            missing gets numbers without a meaning.
+        inverses: the inverse deviation of each normalisation by the name of its result; a missing
+            one gets placeholder numbers.
     """
     network = deepcopy(model)
     graph = OnnxGraph(network)
@@ -187,7 +185,7 @@ def _cubic_convolution(graph: OnnxGraph, node: Node) -> list[Node]:
         convolved,
         kernel_shape=list(weight.shape[2:]),
         strides=[factor] * 2,
-        # It crops what the border becomes.
+        # The pads crop the results of the mirrored border.
         pads=[base.kernel_pad + REACH_PX * factor] * 4,
     )
     return [
@@ -227,7 +225,8 @@ def _two_branches(graph: OnnxGraph, node: Node) -> list[Node]:
     bent_source = source
     before = graph.sole_writer(source)
     # A convolution that only this node reads is computed twice, each time with the factors in its
-    # weights: so each branch is rounded once. Other tensors get a depthwise convolution a branch.
+    # weights, so that each branch is rounded once. For other tensors, each branch gets a depthwise
+    # convolution.
     if before is not None and is_convolution(graph, before):
         bent_source = f"{output}.source"
         twin = Node.of(before.written())

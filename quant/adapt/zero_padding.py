@@ -13,7 +13,7 @@ from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 
 MIRRORED_PX = 16
-"""The number of pixels by which the image is mirrored, or more where strides need a multiple."""
+"""The width of the mirrored border in pixels, rounded up to a multiple of the strides."""
 
 
 def pads_of(graph: OnnxGraph, node: Node) -> tuple[int, ...]:
@@ -52,9 +52,9 @@ def pad_by_zeros(model: onnx.ModelProto) -> None:
         tiling = tiling_of(model)
     except ModelError as error:
         raise ModelError(
-            "Reflecting padding is replaced by zeros around the mirrored image, but this network "
-            "computes with its whole image, to which the border would belong. Pad by zeros, and "
-            "train it again."
+            "Reflecting padding cannot be replaced in this network, because it computes with the "
+            "whole image, and the replacement adds a mirrored border to the image. Pad by zeros, "
+            "and train the network again."
         ) from error
     border_px = -(-MIRRORED_PX // tiling.alignment_px) * tiling.alignment_px
     crop_px = int(border_px * tiling.scale)
