@@ -102,10 +102,10 @@ def _errors(golden: Golden, folder: Path) -> Errors:
     errors: dict[str, list[np.ndarray]] = {}
     for name, file in files.items():
         for path in sorted(path for path in paths if path.name == file):
-            sound = golden.cases[path.parent.name][name]
-            values = _integers(path, sound.shape, golden.core.frac_bits[name])
+            expected = golden.cases[path.parent.name][name]
+            values = _integers(path, expected.shape, golden.core.frac_bits[name])
             # Differences of uint8 or int8 would wrap around, so the values are int16.
-            errors.setdefault(name, []).append(np.abs(values - sound))
+            errors.setdefault(name, []).append(np.abs(values - expected))
     return errors
 
 

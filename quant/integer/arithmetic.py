@@ -17,6 +17,7 @@ FLOAT32_WHOLE_MAX = 2**24
 STRIP_VALUES = 1 << 22
 """The number of window values that are expanded at a time: 16 MB of float32."""
 LEAKY_OF_256 = 26
+"""The slope of LeakyReLU below 0, in 256ths."""
 
 
 def convolve(

@@ -1,5 +1,4 @@
-"""Compute the DPU's arithmetic in integers, as documented and independent of any runtime (facts:
-UG1414 3.5, vai_q).
+"""Compute the DPU's arithmetic in integers, as AMD documents it and independent of any runtime.
 
     convolution: int8 products added in int32, plus bias << shift_bias, ReLU,
                  >> shift_cut rounded, to [-128, 127]
@@ -78,7 +77,8 @@ class Faults:
         return self.shifts.get((op, name), meant)
 
 
-SOUND = Faults()
+NO_FAULTS = Faults()
+"""The default of a run: no fault is injected."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class LayerReport:
 
 
 def run_core(
-    core: IntCore, planes: np.ndarray, half_even: bool = False, faults: Faults = SOUND
+    core: IntCore, planes: np.ndarray, half_even: bool = False, faults: Faults = NO_FAULTS
 ) -> tuple[dict[str, np.ndarray], list[LayerReport]]:
     """Run an integer core on the int8 planes of an image, operation by operation, as the DPU
     computes.
@@ -113,7 +113,7 @@ def run_core(
         planes: (N, P, H, W) int8, as `HostPart.encode` returns them.
         half_even: True rounds ties to even, as onnxruntime does; False rounds them up, as the DPU
             does.
-        faults: the faults that are injected; SOUND has none.
+        faults: the faults that are injected; NO_FAULTS has none.
 
     Returns:
         Every tensor (N, C, H, W) int16 by name, and one report per operation.
@@ -127,7 +127,7 @@ def run_core(
         tensors[op.output] = faults.touch(op.output, result)
         ends = (result == INT8_MAX) | (result == INT8_MIN)
         largest = max(int(np.abs(sums).max()), 1)
-        # The bits that an activation appends come behind the accumulator, which never holds them.
+        # An activation appends its bits behind the accumulator, which never holds them.
         peak = max(float(np.log2(largest)) - finer, 0.0)
         reports.append(LayerReport(op.name, peak, bound, float(ends.mean()), ties))
     return tensors, reports
@@ -176,7 +176,7 @@ INT8_BITS = 7.0
 
 
 def layer_sums(
-    core: IntCore, op: IntConv | Op, tensors: Mapping[str, np.ndarray], faults: Faults = SOUND
+    core: IntCore, op: IntConv | Op, tensors: Mapping[str, np.ndarray], faults: Faults = NO_FAULTS
 ) -> Sums:
     """Compute the integer sums of an operation, before they are shifted and rounded to int8.
 

@@ -361,11 +361,18 @@ def _one_copy(op: IntConv, host_part: HostPart) -> IntConv:
 def _all_copies(
     last: IntConv, host_part: HostPart, weight: np.ndarray, bias: np.ndarray
 ) -> tuple[IntConv, HostPart]:
-    """Move all copies as one was trained, the coarse one by an eighth; a window's bias moves the
-    host's offsets.
+    """Change all copies of the result as the trained one changed, each in proportion to its gain.
 
-    `weight` (O, I, kh, kw) and `bias` (O,) are those of the trained copy, in integers; the bias of
-    a window is in units of its scale, with the offset.
+    The bias of a window changes the host's offsets instead.
+
+    Args:
+        last: the last convolution, with all copies before the training.
+        host_part: the host's part before the training.
+        weight: (O, I, kh, kw) the integer weights of the trained copy.
+        bias: (O,) its integer bias; that of a window in units of its scale, with the offset.
+
+    Returns:
+        The last convolution and the host's part after the training.
     """
     one = _one_copy(last, host_part)
     decoding = host_part.decoding

@@ -85,7 +85,7 @@ def with_windows(
         high = np.maximum(high, result[0].max((1, 2)))
     # The coarse copy takes one of the places that a convolution's channels have.
     most = min(MAX_WINDOWS, MAX_CHANNELS // len(low) - 1)
-    # A window is believed up to FINE_MAX units on either side of its middle.
+    # The result of a window is used up to FINE_MAX units on either side of its middle.
     unit = 2.0 ** -(frac_bits + OffsetWindows.finer_bits)
     needed = np.ceil((high - low).max() / (2 * FINE_MAX * unit))
     count = int(np.clip(needed, 1, max(most, 1)))

@@ -13,9 +13,10 @@ powers of two.
 4. Try them on one tensor after the other, from the last, because late roundings reach the result
    directly. Then try its channels larger and smaller, separately or in groups.
 
-In addition to a residual group this improved no network of dense convolutions for one sensor. It
-helps those with depthwise convolutions. It also helps those behind a bank. One file then serves
-sensors of little and of much noise, and tensors inside a block are small in most channels.
+If a residual group is equalised too, this improved no network of dense convolutions for one sensor.
+It improves networks with depthwise convolutions. It also improves those behind a bank, because one
+file then serves sensors of little and of much noise, so that tensors inside a block are small in
+most channels.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -43,10 +44,10 @@ from beers_deploy.quant.passes.trial import Costs, Trial, Trials
 
 GAMMAS = (0.0, 0.25, 0.5, 1.0)
 HEADROOM = (0.5, 0.75, 1.0, 1.4)
-"""Candidates of the first guess, as in `quant.passes.equalize`; at 0.5 twice the
-range still fits.
+"""Candidates of the first guess, as in `quant.passes.equalize`; at 0.5 twice the range still
+fits.
 """
-TILES = 0.85
+TILE_QUANTILE = 0.85
 """The range of a channel is this quantile over the tiles.
 
 The widest tile would determine the step of all others: with the brightest ground among the patches,
@@ -55,10 +56,10 @@ a DnCNN lost 1.4 dB instead of 0.6 (measured on photographs).
 FEW_TENSORS = 4
 """The number of tensors of a deep network with a residual group that are tried one by one."""
 
-EVERY = 8
-CLEARLY = 1.1
-"""A guess is tried on every EVERY-th crop first, and rejected if its error there is larger by the
-factor CLEARLY.
+SUBSET_STEP = 8
+CLEAR_FACTOR = 1.1
+"""A guess is first tried on every SUBSET_STEP-th crop, and rejected if its error there is larger by
+the factor CLEAR_FACTOR.
 """
 
 
@@ -159,7 +160,7 @@ def single_ranges(
     images: Iterable[np.ndarray],
     host_part: HostPart,
     quantile: float = QUANTILE,
-    tiles: float = TILES,
+    tile_quantile: float = TILE_QUANTILE,
 ) -> np.ndarray:
     """Measure the range of every channel of the tensors: the one that most tiles of the images stay
     within.
@@ -172,14 +173,16 @@ def single_ranges(
         host_part: the host's pre- and post-processing around the graph.
         quantile: the quantile of a channel's absolute values that is its range in one tile; 1 means
             the largest value.
-        tiles: the quantile of these ranges over the tiles.
+        tile_quantile: the quantile of these ranges over the tiles.
 
     Returns:
         (sum of the channels,) the ranges, in the tensors' unit.
     """
     sizes = channel_sizes(graph, list(singles.tensors), images, host_part, quantile)
     by_tensor = zip(*sizes, strict=True)
-    return np.concatenate([above_dead(np.quantile(each, tiles, axis=0)) for each in by_tensor])
+    return np.concatenate(
+        [above_dead(np.quantile(each, tile_quantile, axis=0)) for each in by_tensor]
+    )
 
 
 def equalize_single(
@@ -191,7 +194,7 @@ def equalize_single(
     effort: Effort,
     most_groups: int,
 ) -> np.ndarray:
-    """Search the factors of all channels with which the INT8 network errs least.
+    """Search the factors of all channels with which the error of the INT8 network is least.
 
     Args:
         graph: the float graph to which the tensors belong.
@@ -267,12 +270,12 @@ def _costs_of_one(trial: Trial, graph: Graph, name: str, part: slice, factors: n
 def _better(factors: np.ndarray, costs_of: Callable[[np.ndarray], Costs], best: Best) -> Best:
     """Return the better of two candidates on all crops.
 
-    So large a step may cost the hardest crops and still be worth it.
+    A step this large may be worth its cost even if the hardest crops get worse.
     """
     cost = costs_of(factors)
-    # An eighth of the runs shows which guesses are clearly worse.
-    some = np.arange(0, len(best.costs), EVERY)
-    if cost(some).sum() > CLEARLY * best.costs[some].sum():
+    # A few crops show which guesses are clearly worse.
+    some = np.arange(0, len(best.costs), SUBSET_STEP)
+    if cost(some).sum() > CLEAR_FACTOR * best.costs[some].sum():
         return best
     costs = cost(None)
     return Best(factors, costs) if costs.sum() < best.costs.sum() else best

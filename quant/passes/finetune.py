@@ -42,6 +42,7 @@ from beers_deploy.quant.untrusted import times
 HELD_OUT_EVERY = 8
 """One of this number of pairs is not trained on, and is used to select the result."""
 MOST_HELD_OUT = 48
+"""The maximum number of these pairs."""
 BATCH_PIXELS = 4 * 128**2
 """The number of pixels of the planes in one step."""
 BORDER_PX = 8
@@ -58,6 +59,7 @@ STEADINESS = 0.99
 LEAST_GAIN = 0.02
 """A round that recovers less than this share of the initial INT8 loss gained little."""
 JUDGED_EVERY = 50
+"""The number of steps after which a result is compared on the pairs that are held out."""
 JUDGING = 48
 """The number of training pairs on which scales are judged."""
 
@@ -181,14 +183,14 @@ def finetune(
     """
     # 1.
     samples = list(_samples(core.host_part, full, tuning))
-    # Too few samples to hold one out are trained on and judged by.
+    # If there are too few samples to hold one out, all are used for both.
     held_out = (samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or samples)[:MOST_HELD_OUT]
     training = [sample for k, sample in enumerate(samples) if (k + 1) % HELD_OUT_EVERY] or samples
     rounds = (tuning.steps,) if tuning.steps else ROUNDS
     most = f"{'' if tuning.steps else 'at most '}{sum(rounds)}"
     trainable = TrainableCore(core)
     generator = torch.Generator().manual_seed(tuning.seed)
-    # A scale that is too fine clips first what has the largest results.
+    # If a scale is too fine, the samples with the largest results clip first.
     order = sorted(training, key=lambda sample: float(sample.floats.abs().max()), reverse=True)
     judging = hardest_and_others(order, JUDGING)
     first = least = before = loss_of(core, held_out)
@@ -213,7 +215,7 @@ def finetune(
                     core = candidate
                     least = loss
                 if left == steps:
-                    # What moved scales gained says nothing of the pace.
+                    # The gain of other scales says nothing about the pace.
                     before = least
                 step(
                     f"fine-tuning, step {done + steps - left} of {most}: held-out pairs lose "

@@ -7,7 +7,7 @@ image: its range is wide and its steps are coarse, although the result hardly de
 1. Find a sum of the head's features and others that the last convolution (tail) alone reads.
 2. Divide each feature of the head into its detail and the pixel itself times a gain, the sum of the
    feature's weights.
-3. Add only the detail. Put the pixel's coarse part and remainder beside the sum, as channels of
+3. Add only the detail. Put the pixel's coarse part and remainder next to the sum, as channels of
    their own.
 4. Let the tail read these channels too, with its weights times the gains of the features.
 
@@ -43,7 +43,7 @@ are exact: no value is clipped, and none is a tie that boards and processors rou
 
 
 def split_long_skip(graph: Graph) -> Graph:
-    """Return the graph whose last convolution reads the image beside a sum of details.
+    """Return the graph whose last convolution reads the image next to a sum of details.
 
     Args:
         graph: a float graph that reads the int8 planes that an image is split into.
@@ -58,7 +58,7 @@ def split_long_skip(graph: Graph) -> Graph:
             tail = readers[0] if len(readers) == 1 else None
             ends_graph = isinstance(tail, Conv) and tail.output == CORRECTION and tail.groups == 1
             if head is not None and isinstance(tail, Conv) and ends_graph:
-                # Weights that overflow are refused where the float network is run.
+                # Weights that overflow are rejected where the float network is run.
                 with np.errstate(over="ignore", invalid="ignore"):
                     return _split(graph, head, add, tail)
     return graph

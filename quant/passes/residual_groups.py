@@ -163,12 +163,13 @@ def _passes_channels(op: Op) -> bool:
 
 
 def _passes_factors(graph: Graph, group: ResidualGroup) -> bool:
-    """Return True if factors pass.
+    """Return True if all operations on a group's tensors allow a factor for each channel.
 
-    They pass through ReLU6 where `equalize` may make int8's end its clip, so not behind an add.
+    ReLU6 allows it behind a convolution, where `equalize` can make the end of int8 its clip, but
+    not behind an add.
     """
     touching = [op for op in graph if group.keys() & {*op.inputs, op.output}]
-    # The host writes the planes and reads the correction, and knows no factors.
+    # The host, which has no factors, writes the planes and reads the correction.
     if group.keys() & {PLANES, CORRECTION}:
         return False
     if not all(isinstance(op, Conv | Add) or _passes_channels(op) for op in touching):

@@ -163,7 +163,7 @@ def test_cases_repeat_for_a_seed_and_state_whether_their_pixels_are_valid(case: 
         np.testing.assert_array_equal(image, repeated)
         assert image.dtype == np.float32
         valid = bool(np.isfinite(image).all()) and image.min() >= 0 and image.max() <= FULL_DN
-        assert valid == (case.pixels == "sound")
+        assert valid == (case.pixels == "valid")
 
 
 def test_the_command_writes_its_figures_and_fails_by_exit_code(

@@ -16,7 +16,7 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.graph import Activation
-from beers_deploy.quant.integer.reference import SOUND
+from beers_deploy.quant.integer.reference import NO_FAULTS
 from beers_deploy.quant.samples.simulated import Calibration
 from beers_deploy.studies.stress import faults
 from beers_deploy.studies.stress.bit_flips import (
@@ -95,19 +95,21 @@ def test_the_same_seed_flips_the_same_bits(
 def test_an_injection_leaves_the_target_alone(memory: str, target: FaultTarget) -> None:
     image = target.pairs[0][0]
     before = image.copy()
-    fault_free = restored(Injected(target.core, SOUND, image, 0))
+    fault_free = restored(Injected(target.core, NO_FAULTS, image, 0))
     injected = MEMORIES[memory].inject(target.core, image, 50_000, np.random.default_rng(0))
     assert injected.flips > 0
     assert not np.array_equal(restored(injected), fault_free)
     assert_array_equal(restored(injected), restored(injected))
     assert_array_equal(image, before)
-    assert_array_equal(restored(Injected(target.core, SOUND, target.pairs[0][0], 0)), fault_free)
+    assert_array_equal(
+        restored(Injected(target.core, NO_FAULTS, target.pairs[0][0], 0)), fault_free
+    )
 
 
 def test_at_half_resolution_maps_have_8_bits_per_channel_and_place(coarse: Subject) -> None:
     target = make_target(coarse, SOURCE)
     image, _ = target.pairs[0]
-    result = restored(Injected(target.core, SOUND, target.pairs[0][0], 0))
+    result = restored(Injected(target.core, NO_FAULTS, target.pairs[0][0], 0))
     assert result.shape == image.shape
     assert np.abs(result - image).max() > 0
     every = MEMORIES["maps"].inject(target.core, image, 1e6, np.random.default_rng(0))

@@ -13,7 +13,7 @@ from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.graph import CORRECTION, PLANES, Activation
 from beers_deploy.quant.host_part import IMAGE_SLICES
-from beers_deploy.quant.integer.reference import SOUND, Faults, merged_correction, run_core
+from beers_deploy.quant.integer.reference import NO_FAULTS, Faults, merged_correction, run_core
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.studies.stress.faults import (
     SHIFT_BITS,
@@ -143,7 +143,8 @@ def guards(core: IntCore) -> Guards:
 def test_calibration_patches_pass_untouched(core: IntCore, guards: Guards) -> None:
     for seed in range(3):
         bare, clamped = (
-            run_core(core, planes(seed), faults=f)[0] for f in (SOUND, guarded(SOUND, guards))
+            run_core(core, planes(seed), faults=f)[0]
+            for f in (NO_FAULTS, guarded(NO_FAULTS, guards))
         )
         assert_array_equal(bare[CORRECTION], clamped[CORRECTION])
         correction = merged_correction(core, bare)
@@ -170,7 +171,7 @@ def test_a_clamped_result_keeps_its_bound_whatever_the_weights(core: IntCore) ->
     )
     injected = flip_weights(core, 2000, np.random.default_rng(0))
     bare, clamped = (
-        run_core(injected, planes(9), faults=f)[0] for f in (SOUND, guarded(SOUND, some))
+        run_core(injected, planes(9), faults=f)[0] for f in (NO_FAULTS, guarded(NO_FAULTS, some))
     )
     assert max(int(bare[name].max()) for name in some.relu6) > 24
     assert max(int(clamped[name].max()) for name in some.relu6) == 24

@@ -38,7 +38,7 @@ RATIO = 2
 FLOAT32_DN = 0.05
 NOISE_DN = 5.0
 BY_NAME = {case.name: case for case in CASES}
-SOUND = [case for case in CASES if case.pixels == "sound" and not case.large]
+VALID = [case for case in CASES if case.pixels == "valid" and not case.large]
 LOST = [case for case in CASES if case.pixels in ("missing", "infinite")]
 
 
@@ -69,7 +69,7 @@ def acquired(image: np.ndarray, sensor: Instrument) -> np.ndarray:
     return acquire(scene, sensor, Draw(0), margin_px=0)
 
 
-@named([*SOUND, BY_NAME["beyond 12 bits"]])
+@named([*VALID, BY_NAME["beyond 12 bits"]])
 def test_the_simulator_gives_digital_numbers_and_the_same_ones_again(case: Case) -> None:
     sensor = sensor_of(case)
     for image in images(case):
@@ -82,7 +82,7 @@ def test_the_simulator_gives_digital_numbers_and_the_same_ones_again(case: Case)
         torch.set_num_threads(1)
 
 
-@named(SOUND)
+@named(VALID)
 def test_the_signal_is_that_of_the_formulas(case: Case) -> None:
     """Before noise and digitization the mean is kept, and the kernel bounds ringing and gain."""
     sensor = sensor_of(case)
@@ -155,7 +155,7 @@ def test_the_traditional_pipeline_is_calm(case: Case) -> None:
         ).numpy()
         assert np.array_equal(result, joined, equal_nan=True)
         assert np.array_equal(result[~valid], image[~valid], equal_nan=True)
-        if case.pixels == "sound":
+        if case.pixels == "valid":
             faithful(image, result, pipeline)
 
 
@@ -194,7 +194,7 @@ def with_gradient(restored: Tensor, reference: Tensor) -> tuple[float, Tensor]:
     return float(total.detach()), gradient
 
 
-@named([*SOUND, BY_NAME["beyond 12 bits"]])
+@named([*VALID, BY_NAME["beyond 12 bits"]])
 def test_the_loss_is_its_formula_and_its_gradient_is_bounded(case: Case) -> None:
     weights = RestorationLoss().weights
     for image in images(case):
@@ -227,7 +227,7 @@ def test_lost_pixels_give_no_number(case: Case) -> None:
             assert not math.isfinite(metric(image, other, FULL_DN))
 
 
-@named([case for case in SOUND if min(images(case)[0].shape) >= MIN_SIDE_PX])
+@named([case for case in VALID if min(images(case)[0].shape) >= MIN_SIDE_PX])
 def test_ssim_is_bounded_symmetric_and_precise(case: Case) -> None:
     for image in images(case):
         other = np.clip(np.rint(noisy(image)), 0, FULL_DN).astype(np.float32)

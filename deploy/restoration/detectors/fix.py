@@ -222,8 +222,8 @@ class FixedSource:
         targets = faulty & ~missing
         # The rows around are read as neighbours only.
         targets[:, : start - top] = targets[:, stop - top :] = False
-        for plane, bad, sound in zip(pixels, targets, ~faulty & ~missing, strict=True):
-            replace_pixels(plane, bad, sound, raster.nodata)
+        for plane, bad, valid in zip(pixels, targets, ~faulty & ~missing, strict=True):
+            replace_pixels(plane, bad, valid, raster.nodata)
         within = slice(start - top, stop - top)
         if isinstance(stored, np.ma.MaskedArray):
             return np.ma.MaskedArray(pixels[:, within], mask=np.ma.getmaskarray(stored)[:, within])
@@ -245,7 +245,7 @@ class FixedSource:
 
 
 def replace_pixels(
-    plane: np.ndarray, bad: np.ndarray, sound: np.ndarray, nodata: float | None = None
+    plane: np.ndarray, bad: np.ndarray, valid: np.ndarray, nodata: float | None = None
 ) -> None:
     """Replace faulty pixels of one band in place, by interpolation between valid neighbours.
 
@@ -254,7 +254,7 @@ def replace_pixels(
     Args:
         plane: the pixels (h, w), which this function changes.
         bad: mask (h, w) of the pixels to replace, bool.
-        sound: mask (h, w) of the valid pixels to interpolate from, bool.
+        valid: mask (h, w) of the valid pixels to interpolate from, bool.
         nodata: the value that marks missing pixels, which no replaced pixel may take; None if there
             is no such value.
     """
@@ -265,7 +265,7 @@ def replace_pixels(
     distance = np.full(len(places), np.inf)
     for one, other, weight in WAYS:
         (left, near), (right, far) = (
-            _nearest(plane, sound, places, np.array(side)) for side in (one, other)
+            _nearest(plane, valid, places, np.array(side)) for side in (one, other)
         )
         both = np.isfinite(near) & np.isfinite(far)
         either = np.isfinite(near) | np.isfinite(far)
@@ -293,7 +293,7 @@ def replace_pixels(
 
 
 def _nearest(
-    plane: np.ndarray, sound: np.ndarray, places: np.ndarray, side: np.ndarray
+    plane: np.ndarray, valid: np.ndarray, places: np.ndarray, side: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the value of the nearest valid pixel to one side of each of n places, (n,), and its
     distance in steps, (n,), which is inf if there is none.
@@ -303,7 +303,7 @@ def _nearest(
     for steps in range(1, REACH_PX + 1):
         rows, columns = (places + steps * side).T
         inside = (rows >= 0) & (rows < plane.shape[0]) & (columns >= 0) & (columns < plane.shape[1])
-        inside[inside] = sound[rows[inside], columns[inside]]
+        inside[inside] = valid[rows[inside], columns[inside]]
         here = inside & np.isinf(distances)
         values[here] = plane[rows[here], columns[here]]
         distances[here] = steps

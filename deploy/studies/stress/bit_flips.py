@@ -25,7 +25,7 @@ from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.graph import Activation
-from beers_deploy.quant.integer.reference import SOUND
+from beers_deploy.quant.integer.reference import NO_FAULTS
 from beers_deploy.quant.samples.simulated import HELD_OUT_SEED, Calibration
 from beers_deploy.report.plots import Curve, curves_svg
 from beers_deploy.results import Table
@@ -177,12 +177,12 @@ def curve_rows(target: FaultTarget, draws: int, seed: int) -> list[Row]:
     """
     clean = []
     for image, reference in target.pairs:
-        sound = faults.Injected(target.core, SOUND, image, 0)
-        bare, clamped = (_quality_db(sound, guards, reference) for guards in (None, target.guards))
+        intact = faults.Injected(target.core, NO_FAULTS, image, 0)
+        bare, clamped = (_quality_db(intact, guards, reference) for guards in (None, target.guards))
         clean.append((bare, clamped, clamped))
     rows = [_curve_row("none", [Injection(0, quality) for quality in clean], "patches")]
     count = sum(len(memory.rates) * memory.times for memory in faults.MEMORIES.values()) * draws
-    with steps("turning bits over", count) as bar:
+    with steps("flipping bits", count) as bar:
         for name, memory in faults.MEMORIES.items():
             for rate in memory.rates:
                 injections = []

@@ -196,7 +196,7 @@ class Case:
         name: the short name in tables.
         draw: the function that draws the images of the case, given a side in pixels and a random
             generator.
-        pixels: "sound" if all pixels are valid, or the fault of some: "missing" (NaN), "infinite",
+        pixels: "valid" if all pixels are valid, or the fault of some: "missing" (NaN), "infinite",
             or "beyond" 12 bits.
         flat: True if all pixels of an image are equal, so that the mean must be preserved.
         large: True if the image is so large that only the checks of a single run are made.
@@ -204,7 +204,7 @@ class Case:
 
     name: str
     draw: Draw
-    pixels: str = "sound"
+    pixels: str = "valid"
     flat: bool = False
     large: bool = False
 

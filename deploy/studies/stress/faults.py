@@ -17,7 +17,7 @@ from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, op_shifts
 from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
 from beers_deploy.quant.graph import PLANES, Activation, channels_of
-from beers_deploy.quant.integer.reference import SOUND, Faults, merged_correction, run_core
+from beers_deploy.quant.integer.reference import NO_FAULTS, Faults, merged_correction, run_core
 
 MEGABIT = 1e6
 INT8_BITS = 8
@@ -221,19 +221,19 @@ def checksums(core: IntCore) -> dict[str, int]:
     }
 
 
-def scrubbed(core: IntCore, sound: IntCore, checks: Mapping[str, int]) -> IntCore:
+def scrubbed(core: IntCore, intact: IntCore, checks: Mapping[str, int]) -> IntCore:
     """Repair the weights of an integer core by their checksums (scrubbing).
 
     Args:
         core: the core, whose weights may have flipped bits.
-        sound: the core without faults.
+        intact: the core without faults.
         checks: the CRC-32 of each convolution without faults, by name.
 
     Returns:
-        The core in which every convolution with another checksum is replaced by that of `sound`.
+        The core in which every convolution with another checksum is replaced by that of `intact`.
     """
     wrong = {name for name, _ in checksums(core).items() - checks.items()}
-    return with_ops(core, (op for op in sound.convolutions if op.name in wrong))
+    return with_ops(core, (op for op in intact.convolutions if op.name in wrong))
 
 
 def voted(copies: tuple[Shifts, Shifts, Shifts]) -> Shifts:
@@ -296,7 +296,7 @@ def _weights(
     core: IntCore, image: np.ndarray, per_megabit: float, generator: np.random.Generator
 ) -> Injected:
     flips = flip_count(weight_bits(core), per_megabit, generator)
-    return Injected(flip_weights(core, flips, generator), SOUND, image, flips)
+    return Injected(flip_weights(core, flips, generator), NO_FAULTS, image, flips)
 
 
 def _shifts(
@@ -342,7 +342,7 @@ def _image(
     flips = flip_count(PIXEL_BITS * image.size, per_megabit, generator)
     # A pixel has 12 bits in memory, whatever type holds it here.
     dn = flip_bits(np.rint(image * MAX_DN).astype(np.uint16), flips, generator, PIXEL_BITS)
-    return Injected(core, SOUND, (dn / np.float32(MAX_DN)).astype(np.float32), flips)
+    return Injected(core, NO_FAULTS, (dn / np.float32(MAX_DN)).astype(np.float32), flips)
 
 
 @dataclass(frozen=True)
@@ -375,7 +375,7 @@ MEMORIES = {
 
 def corrected(
     injected: Injected,
-    sound: IntCore,
+    intact: IntCore,
     guards: Guards,
     per_megabit: float,
     generator: np.random.Generator,
@@ -385,13 +385,13 @@ def corrected(
 
     Args:
         injected: the network after the injection, whose shifts are the first of the three copies.
-        sound: the core without faults.
+        intact: the core without faults.
         guards: the guards of the network, with the checksums of its weights.
         per_megabit: the rate of flips in the other two copies of the shifts, independently.
         generator: draws which bits of these copies flip.
     """
-    core = scrubbed(injected.core, sound, guards.checksums)
-    own = {**shifts_of(sound), **injected.faults.shifts}
-    second, third = (_flip_copy(sound, per_megabit, generator) for _ in range(2))
+    core = scrubbed(injected.core, intact, guards.checksums)
+    own = {**shifts_of(intact), **injected.faults.shifts}
+    second, third = (_flip_copy(intact, per_megabit, generator) for _ in range(2))
     shifts = voted((own, second, third)) if injected.faults.shifts else {}
     return replace(injected, core=core, faults=replace(injected.faults, shifts=shifts))

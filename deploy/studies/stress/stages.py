@@ -41,7 +41,7 @@ def float32(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Meas
     network = subject.float32
     graph = subject.graph
     measures = restoration(network, case, image, GAIN_DN)
-    if case.pixels == "sound" and not case.large and graph is not None:
+    if case.pixels == "valid" and not case.large and graph is not None:
         extended = network.extended(_fractions(image))
         exact = in_torch(graph, torch.from_numpy(extended).double()).numpy()
         error = FULL_DN * float(np.abs(network.infer()(extended) - exact).max())
@@ -61,7 +61,7 @@ def int8(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure
     """Check the INT8 network with onnxruntime's integer kernels on an image (H, W) in DN."""
     network = subject.quantized
     measures = restoration(network, case, image, INT8_GAIN_DN)
-    if case.pixels == "sound" and not case.large:
+    if case.pixels == "valid" and not case.large:
         apart = np.abs(network.restore(image) - subject.float32.restore(image))
         error = float(apart.mean())
         measures.append(checks.Measure("mean error against float", error, checks.FLAT_DN))
@@ -113,7 +113,7 @@ def reference(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Me
     """
     core = subject.core
     network = subject.quantized
-    if case.pixels != "sound":
+    if case.pixels != "valid":
         return []
     crop = network.extended(_fractions(image[:CROP_PX, :CROP_PX]))
     planes = core.host_part.encode(crop)
