@@ -312,7 +312,7 @@ def judged(
         sha256 = comparison.floating.sha256
         baseline.require_same(sha256, result.psnr_float_db, comparison.rests_on)
     checks = judge(result, limits, baseline.mae if baseline else None, comparison.shares)
-    # Without this, the file that is judged would decide itself whether its encoding is checked.
+    # Without this, the file that is judged would decide if its encoding is checked.
     must_describe = baseline is not None and ENCODING in baseline.checks
     checks += file_checks(comparison.floating.model, comparison.int8, target, must_describe)
     notes = [*comparison.notes, *_mae_note(result, limits, checks)]

@@ -80,8 +80,16 @@ class DatasetRecipe:
 
 @dataclass(frozen=True)
 class Window:
-    """The position of one patch: its number in the dataset, its scene, and the top left of its
-    margin in scene pixels.
+    """The position of one patch in a scene.
+
+    Attributes:
+        number: the number of the patch in the dataset.
+        scene: the index of the scene.
+        name: the name of the patch, which its files have.
+        top: the first row of the patch with its margin, in scene pixels.
+        left: its first column.
+        height: its height with the margin, in scene pixels.
+        width: its width.
     """
 
     number: int
@@ -113,7 +121,10 @@ def plan_windows(recipe: DatasetRecipe) -> list[Window]:
                 "scenes of at least that size."
             )
         names = ", ".join(str(path or "the drawn scene") for path in small)
-        raise ImageError(f"Less than {side} scene pixels a side: {names}. Leave them out.")
+        raise ImageError(
+            f"A scene needs at least {side} scene pixels a side. These have less: {names}. Leave "
+            "them out."
+        )
     return windows
 
 
@@ -219,7 +230,7 @@ def write_dataset(
         recipe: the parameters that determine the pixels.
         out: the dataset's folder.
         workers: the number of processes on this host, or of calls that the pool runs at once.
-        resume: whether to continue a dataset that the folder holds in part.
+        resume: True to continue a dataset of which the folder contains a part.
         pool: runs the calls instead of processes on this host; only this process writes.
 
     Returns:

@@ -80,7 +80,7 @@ class Sample:
         Args:
             raw: as the sensor acquired it.
             restored: from it.
-            truth: what the restoration aims at.
+            truth: the image that the restoration aims at.
             sensor: the instrument.
         """
         variances = noise_variances(sensor, sensor.max_dn)

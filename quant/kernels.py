@@ -6,9 +6,9 @@ gives other numbers than the DPU's. On such processors a session computes each o
 fastest way that is proven exact, chosen when the file is opened:
 
 1. Signed: weights are not changed, because no two neighbouring products can leave int16, for any
-   activations. a. A tensor behind a ReLU is stored as 128..255 around 128. Moved down to 0..127
-   around 0, no weights saturate. b. Otherwise all pairs of weights that a kernel may form are
-   checked.
+   activations. A tensor behind a ReLU is stored as 128..255 around 128. Moved down to 0..127
+   around 0, no weights saturate (a). For other tensors, all pairs of weights that a kernel may form
+   are checked (b).
 2. Unsigned: weights are stored as uint8, 128 higher and around 128. These kernels add in int32, at
    half the speed.
 3. Converted: the same for signed activations, which are converted to uint8 before the operator, and

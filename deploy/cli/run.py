@@ -108,7 +108,7 @@ def table_of(result: Any) -> Any:
     """Return the table to print for the result of a verb.
 
     Args:
-        result: what the verb returned: a `Table`, or a value such as a `Network`.
+        result: the result of the verb: a `Table`, or a value such as a `Network`.
 
     Returns:
         The table itself, or the attribute `table` of the value; None if there is neither.

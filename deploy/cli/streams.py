@@ -75,7 +75,7 @@ def lasting_streams(results_on_stdout: bool) -> Iterator[Stream]:
             everything else that is printed goes to standard error.
 
     Yields:
-        The wrapped standard output, whose `lost` says at the end whether text was dropped.
+        The wrapped standard output, whose `lost` states at the end why text was dropped.
     """
     out = Stream(sys.stdout)
     sys.stdout = cast(TextIO, out)

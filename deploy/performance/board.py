@@ -120,7 +120,7 @@ class Question:
         halo: the pixels around a tile that are computed and discarded: "exact" for as many as the
             network needs to leave no seams, or a number.
         within_s: the time limit of the swath in s; None for no limit.
-        task: what the host does with the results; None derives it from the network's operators.
+        task: the host's task with the results; None derives it from the network's operators.
         consistency: True if the host computes the consistency step, which makes block means of the
             result agree with the raw image.
     """

@@ -112,7 +112,7 @@ def predict_network(
         network: the network, or its file or name.
         dpu: the configuration of the DPU.
         tile_px: side of a tile in pixels; None for the size that the network is fixed to.
-        task: what the host does with the results; None derives it from the network's operators.
+        task: the host's task with the results; None derives it from the network's operators.
         step_px: pixels of a tile for which the host computes the consistency step; 0 for no step.
 
     Raises:

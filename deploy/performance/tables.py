@@ -175,7 +175,7 @@ def sweep_rows(
         swath: the image; its halo is used for all tile sizes.
         boards: the DPU configurations.
         tiles_px: the sides of the tiles in pixels.
-        task: what the host does with the results; None derives it from the network's operators.
+        task: the host's task with the results; None derives it from the network's operators.
 
     Returns:
         A row for each combination: all tile sizes of the first configuration, then of the next.

@@ -184,7 +184,7 @@ def evaluate(
 
 
 def named_methods(methods: Methods) -> dict[str, Any]:
-    """Return what restores by the name of its row, the degraded input first."""
+    """Return the methods by the names of their rows, the degraded input first."""
     if isinstance(methods, Mapping):
         return {"degraded": "degraded", **methods}
     names = methods.split(",") if isinstance(methods, str) else methods
@@ -198,12 +198,12 @@ def named_methods(methods: Methods) -> dict[str, Any]:
 
 
 def numbers_of(name: str, value: Factors, example: str) -> tuple[float, ...]:
-    """Return the numbers of an option, which are text with commas or numbers.
+    """Return the numbers of an option, which are numbers or text with commas.
 
     Args:
-        name: of the option.
+        name: the name of the option.
         value: its value.
-        example: of a value, for the error.
+        example: a valid value, for the error.
     """
     parts = value.split(",") if isinstance(value, str) else value
     try:
@@ -257,7 +257,7 @@ def _detection(
     seed: int,
     out: Path | None,
 ) -> "Table":
-    """Return what a detector finds in labelled images, degraded and restored."""
+    """Return the accuracy of a detector on labelled images, degraded and restored."""
     from beers_deploy.profiles.sensor import Sensor
     from beers_deploy.studies.detection.detector import open_detector, parse_classes
     from beers_deploy.studies.detection.page import write_page

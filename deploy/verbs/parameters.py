@@ -23,8 +23,8 @@ class Completed:
     """Names that a shell completes.
 
     Attributes:
-        names: returns them.
-        listed: whether the help lists them.
+        names: the function that returns the names.
+        listed: True if the help lists them.
     """
 
     names: Callable[[], Sequence[str]]
@@ -36,10 +36,10 @@ class Written:
     """Marks a parameter that names an output.
 
     Attributes:
-        folder: whether it is a folder.
-        required: whether the command line must have it, where Python may do without a file.
-        verdict: whether an older file is deleted first: it must not pass for the verdict of a run
-            that is refused.
+        folder: True if the output is a folder.
+        required: True if the command line requires the parameter. Python may do without a file.
+        verdict: True if an older file is deleted first, so that it is not mistaken for the verdict
+            of a run that is refused.
     """
 
     folder: bool = False
@@ -78,7 +78,7 @@ class RequiredUnless:
     """Marks a parameter that the command line must have, unless it has another one.
 
     Attributes:
-        other: the name of that one.
+        other: the name of the other parameter.
     """
 
     other: str
@@ -97,7 +97,7 @@ class Wider:
     """Marks a parameter that has further types in Python, such as arrays, which the verb checks.
 
     Attributes:
-        names: whether the only further type is a list of texts.
+        names: True if the only further type is a list of texts.
     """
 
     names: bool = False

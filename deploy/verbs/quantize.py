@@ -151,7 +151,8 @@ def quantize(
     scenes = path_or_none(images)
     data = Data(Sensor.load(sensor), samples, scenes, patches, seed, patch, input_range)
     result, held_out = quantized(network, data, board, finetune, Effort(effort), adapt, output)
-    # All is made and judged before the first file is written: what is refused leaves none.
+    # All results are made and judged before the first file is written, so that an error leaves
+    # none.
     core = result.core(board, tile) if files[1] else None
     _warn_of_refusals(result, board)
     notes = _notes(result, adapt)
@@ -222,7 +223,7 @@ DETAILS = frozenset(
 
 
 def _notes(result: "Network", adapt: bool) -> list[str]:
-    """Return what the INT8 file records of its calibration, and whether `restore` runs it."""
+    """Return notes on the calibration that the INT8 file records, and on use by `restore`."""
     from beers_deploy.quant.adapt.adaptation import ADAPTED
     from beers_deploy.quant.input_range import KEY
     from beers_deploy.quant.onnx_file import metadata
@@ -247,7 +248,7 @@ def _notes(result: "Network", adapt: bool) -> list[str]:
 
 
 def _warn_of_refusals(result: "Network", board: "TargetProfile") -> None:
-    """Warn if the board does not run what was quantised, which other hardware may."""
+    """Warn if the board does not run the network. Other hardware may run it."""
     from beers_deploy.dpu.checker.table import check_network
 
     # For an NPU the file of the core is checked, which is fixed to a tile.
@@ -257,7 +258,7 @@ def _warn_of_refusals(result: "Network", board: "TargetProfile") -> None:
 
 
 def _judged(network: "Network", held_out: "Patches", pages: list[Path]) -> "tuple[list[Row], str]":
-    """Return what INT8 changes on samples that calibration did not see: rows and a sentence.
+    """Measure the change by INT8 on samples that calibration did not see: rows and a sentence.
 
     The rows state the price of each restriction of the DPU. With pages there are also rows of
     layers and of the worst samples, and all pages but report.json are written.

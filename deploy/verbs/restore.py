@@ -195,7 +195,7 @@ def restore(
 
 
 def _file_of(image: Any) -> Path | None:
-    """Return the path of an image, or None of an array."""
+    """Return the path of an image; None for an array."""
     if isinstance(image, str | os.PathLike):
         return Path(image)
     # A dataset of rasterio has a coordinate system and the name of its file. A DataArray may have
@@ -209,10 +209,10 @@ def _refuse_without_effect(
     """Raise OptionError if an option is given that has no effect.
 
     Args:
-        options: returns whether parameters have another value than their default.
+        options: returns True for each named parameter that has another value than its default.
         method: the parameter `method`.
-        path: of the image, None of an array.
-        writes_none: whether the run is a dry one that names no output.
+        path: the path of the image; None for an array.
+        writes_none: True for a dry run that names no output.
     """
     if method == "traditional":
         refuse_with(
@@ -241,13 +241,13 @@ def _refuse_without_effect(
 
 
 def _traditional(quality: str, unknown: bool) -> "Callable[[], Pipeline]":
-    """Return what makes the traditional pipeline; raise OptionError if the sensor is unknown."""
+    """Return the maker of the traditional pipeline; raise OptionError if the sensor is unknown."""
     if unknown:
         raise OptionError(
             "`method` traditional needs `sensor`, the sensor that acquired the image. Name a "
             "profile ('beers-deploy profiles' lists them), or give your .toml file."
         )
-    # It loads torch, which is optional.
+    # This loads torch, which is optional.
     from beers_deploy.restoration.traditional import TraditionalMethod
 
     return partial(TraditionalMethod, quality)
@@ -260,13 +260,13 @@ def _output(
     fix_detectors: str,
     **how: Any,
 ) -> "Output":
-    """Return what is written; raise OptionError if it is not named, or if it exists.
+    """Return the output of a run; raise OptionError if it has no name, or a file of it exists.
 
     Args:
         out: the TIFF.
         documents: the STAC item and the view.
-        overwrite: whether these files may exist. They may too if a stopped run can be resumed.
-        fix_detectors: what was asked about faulty detectors.
+        overwrite: True if these files may exist. They may too if a stopped run can be resumed.
+        fix_detectors: the parameter of this name; "" if it is not given.
         how: the other fields of `Output`.
     """
     from beers_deploy.model.io.lock import part_folder
@@ -320,7 +320,7 @@ def _write_documents(
 
 
 def _preview(image: Path, pipeline: "NetworkPipeline", reading: "Reading") -> "Table":
-    """Return what an image is, how it would be cut and how long that would take."""
+    """Return a table of the properties of an image, its tiles and the predicted time."""
     from beers_deploy.performance.dry_run import preview_row
     from beers_deploy.profiles.target import TargetProfile
     from beers_deploy.results import Table

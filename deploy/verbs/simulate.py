@@ -189,7 +189,7 @@ def _recipe(
     seed: int,
     tolerance_dn: float,
 ) -> "DatasetRecipe":
-    """Return what decides the pixels of a data set."""
+    """Return the recipe of a data set, which determines its pixels."""
     from beers_deploy.model.dataset import DatasetRecipe
     from beers_deploy.profiles.reference import reference_beside
 
@@ -248,7 +248,7 @@ def _write(
 
 
 def _decisions(recipe: "DatasetRecipe", origins: Mapping[str, str]) -> "Table":
-    """Return what is decided of each effect, for the first draw of the sensor and every scene."""
+    """Return the decision on each effect, for the first draw of the sensor and every scene."""
     from beers_deploy.model.dataset import load
     from beers_deploy.model.simulator.acquire import prepare_scene
     from beers_deploy.model.simulator.detector import Draw

@@ -78,7 +78,7 @@ def require_allowed(parameter: Parameter, value: object) -> None:
 
     Args:
         parameter: annotated with its type, and perhaps with an `Interval` or a `Literal`.
-        value: what was given; the default is always allowed.
+        value: its value; the default is always allowed.
     """
     name = parameter.name
     if isinstance(value, str) and value == "":
@@ -263,19 +263,22 @@ def path_or_none(value: InputPath | None) -> Path | None:
 def changed(
     function: Callable[..., Any], values: Mapping[str, Any], *names: str
 ) -> dict[str, bool]:
-    """Return whether parameters have another value than their default, by name.
+    """Compare the values of some parameters with their defaults.
 
     Args:
         function: the verb.
-        values: of its parameters, by name.
-        names: of the parameters that are asked about.
+        values: the values of its parameters, by name.
+        names: the names of the parameters to compare.
+
+    Returns:
+        True for each parameter that has another value than its default, by name.
     """
     parameters = signature(function).parameters
     different = {}
     for name in names:
         value = values[name]
         default = parameters[name].default
-        # An array compares element by element, and is no default.
+        # An array is never a default, and would be compared element by element.
         is_plain = isinstance(value, str | Real | Path | Sequence | Mapping)
         different[name] = value is not default and not (is_plain and bool(value == default))
     return different
@@ -286,7 +289,7 @@ def refuse_with(other: str, **options: bool) -> None:
 
     Args:
         other: the other option, in backquotes, with its value where that matters.
-        options: whether each option is given, by its name.
+        options: True for each option that is given, by its name.
     """
     for name, is_set in options.items():
         if is_set:
@@ -298,7 +301,7 @@ def refuse_without(other: str, **options: bool) -> None:
 
     Args:
         other: the other option, in backquotes.
-        options: whether each option is given, by its name.
+        options: True for each option that is given, by its name.
     """
     for name, is_set in options.items():
         if is_set:

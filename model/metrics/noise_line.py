@@ -134,7 +134,7 @@ def fit_noise(blocks: Blocks, incomplete: bool = False) -> NoiseModel | Refusal:
 
     Args:
         blocks: the blocks of all images.
-        incomplete: whether to accept noise that is not white, and noise at only one level of light.
+        incomplete: True to accept noise that is not white, and noise at only one level of light.
 
     Returns:
         The line, or the reason why these images do not determine one.

@@ -194,7 +194,7 @@ def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbon
     Args:
         network: "squeeze" or "vgg".
         path: the weights file, .safetensors or .npz.
-        l2_pool: whether to use DISTS's pooling.
+        l2_pool: True to use DISTS's pooling.
 
     Raises:
         ModelError: the file cannot be read, or lacks a finite tensor of the right shape.

@@ -126,7 +126,7 @@ def costs(acts_on: str) -> dict[str, str]:
     """Return what each effect costs in computing time, in words, by the name of the effect.
 
     Args:
-        acts_on: what the effects change, "radiance" or "DN".
+        acts_on: the quantity that the effects change, "radiance" or "DN".
     """
     return {name: kind.cost for name, kind in PIXEL_EFFECTS.items() if kind.acts_on == acts_on}
 

@@ -149,13 +149,12 @@ def estimate_groups(
     # lost in float32.
     variance = covariance.diagonal(dim1=1, dim2=2).mean(1) + mean[:, 0].var(1, correction=0)
     flat = variance < (0.0 if settings.clean_guide else FLAT_GAMMA * noise.sigma**2)
-    shrinkage = torch.zeros_like(covariance)
     # The matrix beta S^-1 Sigma, for patches as rows, or 0 where S has no Cholesky factor.
+    shrinkage = torch.zeros_like(covariance)
     covariance = covariance[~flat]
     sigma_matrix = noise.covariance(settings.side_px).to(covariance) * settings.excess
     diagonal = covariance.diagonal(dim1=1, dim2=2)
-    # A drawn or saturated area has rank 0 or 1: the covariance is then no better known than its own
-    # rounding.
+    # A drawn or saturated area has rank 0 or 1. Its covariance is then known only up to rounding.
     diagonal.add_(torch.finfo(covariance.dtype).eps * diagonal.sum(1, keepdim=True))
     if settings.clean_guide:
         covariance = covariance + sigma_matrix

@@ -29,7 +29,7 @@ class PatchRecipe:
         margin_px: the number of pixels that are cropped on each side of a simulated image.
         family: the sensors to draw from instead of `degraded`. Each patch then comes with the
             description of its sensor, and dark patches are brightened as in a restoration.
-        noisy_reference: whether the target image has the noise of the reference.
+        noisy_reference: True if the target image has the noise of the reference.
     """
 
     degraded: Sensor
@@ -63,10 +63,10 @@ def draw_turn(
 
     Args:
         generator: the generator of the draws.
-        quarters: whether odd quarter turns are allowed.
+        quarters: True if odd quarter turns are allowed.
         mirrors: False if the blur is asymmetric; patches are then not changed at all.
     """
-    # Both are drawn whatever is allowed: the generator goes on in the same way.
+    # Both are always drawn, so that the generator continues in the same way.
     quarter = int(generator.integers(4))
     mirrored = bool(generator.integers(2))
     if not mirrors:

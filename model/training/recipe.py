@@ -35,8 +35,7 @@ class Stage:
         steps: the number of gradient steps.
         batch: the number of patches of a step.
         learning_rate: the highest learning rate, which falls to 0 as a cosine.
-        rounding: whether maps are rounded as in the INT8 file of the weights that the stage begins
-            with.
+        rounding: True to round maps as the INT8 file of the initial weights of the stage does.
         precision: the precision of the blocks, float32 or bfloat16.
         average: decay per step of the running average of the weights, which is stored.
     """

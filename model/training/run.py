@@ -47,8 +47,8 @@ STEP = re.compile(r"[0-9]{1,18}(?=,)")
 """The step at the beginning of a line of a log."""
 
 SENSOR_VIEWS = 4
-"""The number of sensors that view each validation image if the network is conditioned, because they
-differ by far more.
+"""The number of sensors that view each validation image if the network is conditioned: these
+sensors differ by far more than the draws of one.
 """
 
 
@@ -57,8 +57,22 @@ class Run:
     """One training run: the options of `train`, or one stage of a recipe.
 
     Attributes:
-        held_out: sites that are not trained on; if none is named, a twentieth of the images is held
-            out.
+        variant: the name of the network's size.
+        recipe: the schedule and the seed.
+        patches: how patches are made, and from which sensors.
+        images: the scenes from which patches are simulated.
+        pairs: a folder of stored pairs to learn from instead; None for none.
+        out: the folder of the run.
+        drawn: the number of scenes to draw in addition.
+        charts: the number of charts to draw in addition.
+        held_out: the sites that are not trained on; if none is named, a twentieth of the images is
+            held out.
+        lpips: the weights of SqueezeNet for LPIPS, or their folder; None searches for them.
+        start: the weights to start from; None draws new ones.
+        validate_steps: the number of steps between two validations.
+        device: the device that computes the steps.
+        precision: the number format of the body.
+        rounding: the steps by which maps are rounded; None does not round them.
     """
 
     variant: str
@@ -93,7 +107,7 @@ def train(run: Run, resume: bool, worker: Worker) -> None:
 
     Args:
         run: the options of the run.
-        resume: whether to continue from the checkpoint of the run.
+        resume: True to continue from the checkpoint of the run.
         worker: the rank of this process among those that train together.
     """
     variant = variant_named(run.variant)

@@ -57,7 +57,7 @@ class Step:
         loss: the function that computes the loss of its output.
         forward: the network, or a wrapper that averages its gradients over workers.
         gradient_norm: the norm to which larger gradients are clipped.
-        bfloat16: whether the blocks compute in bfloat16.
+        bfloat16: True if the blocks compute in bfloat16.
         rounding: how maps are rounded; None does not round them.
         agree: see `Agree`; None for a single worker.
 

@@ -152,7 +152,7 @@ class Trainer:
         start: a network of the same kind and size to continue from; None draws new weights.
         precision: number format of the body; it depends on the machine, and a resumed run may use
             another.
-        conditioned: whether the network is given the sensor of each patch.
+        conditioned: True if the network reads the sensor of each patch.
         rounding: the steps by which the INT8 file of a conditioned network rounds its feature maps,
             so that the training rounds them too; None trains without rounding.
 

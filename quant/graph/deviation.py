@@ -33,7 +33,7 @@ class Deviation:
         is_of_pixels: True for a deviation over the channels.
         side_px: the sides of x; 0 if they are not known.
         scale: (C,) or (1,) the factor of the variance.
-        epsilon: what is added to the variance.
+        epsilon: the number that is added to the variance.
     """
 
     root: Node
@@ -157,11 +157,11 @@ def _axes_of_mean(graph: OnnxGraph, node: Node | None) -> tuple[int, ...]:
 
 
 def scaled(graph: OnnxGraph, name: str, is_sole: bool = True) -> tuple[str, Affine]:
-    """Return the tensor that constants scale and shift to another, and what they do together.
+    """Follow scalings and shifts by constants upwards from a tensor, as `affine_chain` does.
 
     Args:
         graph: the graph.
-        name: the name of the other tensor.
+        name: the name of the tensor to start from.
         is_sole: True to follow only tensors that nothing else reads.
     """
     name, affine = affine_chain(graph, name, is_sole)

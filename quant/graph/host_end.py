@@ -27,14 +27,15 @@ ACTIVATIONS = {"Sigmoid", "Tanh"}
 
 @dataclass(frozen=True)
 class HostEnd:
-    """What the host computes at the end of a float network.
+    """The operations at the end of a float network that the host computes.
 
     Attributes:
         replaced: for the result of each node that the host computes, the tensor that takes its
             place in the core.
         crop_px: the number of pixels of the result that are cut off at each side.
         limits: low and high end to which the network clips its result; empty if it does not.
-        base: what the network adds its result to; None for nothing, or the image itself.
+        base: the enlarged image that the result is added to; None if it is added to the image
+            itself, or to nothing.
         activation: "Sigmoid" or "Tanh"; empty if there is none.
         adds_in_core: True if a sum with the image that ends the core is not the last sum, so that
             the host does not compute it.

@@ -63,7 +63,7 @@ class Normalization:
         channels: of x.
         scale: (C,) or (1,) the factor behind the quotient.
         shift: (C,) or (1,) what is added to it.
-        epsilon: what is added to the variance.
+        epsilon: the number that is added to the variance.
         is_centred: False if x itself is divided by the deviation, with its mean.
     """
 

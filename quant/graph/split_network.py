@@ -59,7 +59,7 @@ class SplitNetwork:
         limits: the low and the high end to which the network clips the result; empty if it does
             not.
         activation: "Sigmoid" or "Tanh" of the result, in front of the add; empty for none.
-        base: what of the image is added.
+        base: the part of the image that is added.
     """
 
     graph: Graph = field(compare=False)

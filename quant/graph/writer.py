@@ -158,7 +158,7 @@ def write_base(w: GraphWriter, base: Base, image: str) -> str:
 
     Args:
         w: the writer that receives the nodes.
-        base: what of the image is added.
+        base: the part of the image that is added.
         image: the name of the image.
     """
     if base.channels:

@@ -57,7 +57,7 @@ class HostPart:
         crop_px: the number of pixels that are cut off at each side of the result, before the image
             is added. The core computes them for the mirrored border.
         activation: "Sigmoid" or "Tanh" of the decoded result; empty for none.
-        base: what of the image is added.
+        base: the part of the image that is added.
     """
 
     channels: int = 1

@@ -3,7 +3,7 @@
 A DPU computes an activation in one pass with a convolution, and not behind a pixel shuffle, a
 concat, a pooling or an enlargement. It shuffles the results of convolutions alone.
 
-1. An activation is computed for each value alone, so that it may as well precede a pixel shuffle, a
+1. An activation is computed for each value alone, so that it can also precede a pixel shuffle, a
    concat or an enlargement that repeats pixels.
 2. A rising activation may also precede a maximum.
 3. It is moved only where it reaches convolutions that nothing else reads, and through several such
@@ -32,7 +32,7 @@ MAY_FOLLOW = {
     "HardSwish": CONVOLUTIONS,
     "Relu": CONVOLUTIONS | {"Add"},
 }
-"""The operators that a DPU computes one of these behind."""
+"""The operators behind which a DPU computes each of these."""
 HOST = {"Add", "Clip", "DepthToSpace"}
 """Operators that may follow a pixel shuffle that the host computes."""
 

@@ -87,7 +87,8 @@ def _compute(
         source: the map.
         channels: the numbers of the channels, (C,).
         name: the name of the part.
-        divides: whether the map is never needed as a whole (1), or the channels are selected (2).
+        divides: True if the map is never needed as a whole, so that its operations are divided (1);
+            False if the channels are selected (2).
     """
     before = graph.writers.get(source) if divides else None
     inner = f"{name}.before"

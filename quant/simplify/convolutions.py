@@ -14,8 +14,8 @@ All of it is exact except for the rounding of float32. A DPU also multiplies by 
 2. Where a part of a large kernel would begin or end inside the map, as with a kernel without
 padding, a depthwise convolution that reads one pixel crops the map first. A kernel is not split if
 one of its rows is too large. It is not split either if it has a side without padding and is longer
-than any target convolves with, because it may be that of a layer as large as its map, which targets
-compute in another way.
+than any target's kernels, because it may be as large as its map. Targets compute such a layer in
+another way.
 """
 
 import numpy as np
@@ -24,9 +24,11 @@ from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.fold_affine import is_convolution
 
 MOST_POSITIONS = 49
-"""Height times width of a part, 7 x 7. Every target computes at most 53."""
+"""The maximum height times width of a part, 7 x 7. The smallest limit of a target is 53."""
 LARGE_POSITIONS = 64
-"""Height times width, 8 x 8, up to which a kernel is not split, because some targets compute it."""
+"""Kernels up to this height times width, 8 x 8, are not split, because some targets compute
+them.
+"""
 LONGEST_SIDE = 16
 """The longest side of a kernel that is split although a side has no padding."""
 

@@ -189,13 +189,15 @@ def affine_of(graph: OnnxGraph, node: Node) -> tuple[str, Affine] | None:
 
 
 def affine_chain(graph: OnnxGraph, name: str, is_sole: bool = True) -> tuple[str, Affine]:
-    """Return the tensor that scalings and shifts by constants make another of, and what they do
-    together.
+    """Follow scalings and shifts by constants upwards from a tensor.
 
     Args:
         graph: the graph.
-        name: the tensor that they result in.
+        name: the tensor to start from.
         is_sole: True to follow only tensors that nothing else reads.
+
+    Returns:
+        The tensor in front of the first of them, and their joint scaling and shift.
     """
     one = np.ones(1)
     total = Affine(one, 0 * one)

@@ -125,12 +125,12 @@ def connect_neighbours(graph: OnnxGraph, node: Node) -> list[Node] | None:
     channels = size[1] if len(size) == 4 else 0
     if node.op_type not in MOVES or not channels or size[2:] != (1, 1):
         return None
-    activations, convolution = _behind(graph, result, MOVES | POINTWISE)
+    activations, convolution = _in_front(graph, result, MOVES | POINTWISE)
     weight = graph.value(convolution, 1) if convolution is not None else None
     if convolution is None or convolution.op_type != "Conv" or len(convolution.inputs) != 2:
         return None
     # Nodes that move values keep the order of the channels, because each other size is 1.
-    _, before = _behind(graph, convolution.source, MOVES)
+    _, before = _in_front(graph, convolution.source, MOVES)
     source = before.result if before is not None else ""
     if (
         weight is None
@@ -156,7 +156,7 @@ def connect_neighbours(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return nodes
 
 
-def _behind(graph: OnnxGraph, name: str, skipped: set[str]) -> tuple[list[Node], Node | None]:
+def _in_front(graph: OnnxGraph, name: str, skipped: set[str]) -> tuple[list[Node], Node | None]:
     """Return the first node in front of a tensor whose operator is not to be skipped, and the
     activations between, in order.
     """

@@ -20,7 +20,7 @@ WINDOWS = {"AveragePool", "Conv", "MaxPool"}
 """Operators whose pads add pixels around a map; those of a transposed convolution cut its result.
 """
 WHOLE_IMAGE = "Global", "Reduce"
-"""How the names of operators begin that read the whole image."""
+"""The beginnings of the names of operators that read the whole image."""
 SIZES_PX = (256, 320), (384, 512)
 """Rows and columns of the two images."""
 MOST_PX = 128

@@ -1,4 +1,4 @@
-"""Count the work of the host for one image, and estimate the time of what no rate is published for.
+"""Count the work of the host for one image, and estimate its time where no rate is published.
 
 The host copies the image in and the results out, and then has a task, such as finding the best of
 classes. The rates of these are fitted constants (`model`). The time of nodes that the DPU refuses
@@ -44,7 +44,7 @@ def host_work(bytes_in: float, bytes_out: float, values: float, task: Task) -> A
         bytes_out: bytes of the DPU's results. They are not copied for the task "image", which
             converts them to pixels anyway.
         values: number of result values that the task reads.
-        task: what the host does with the results.
+        task: the host's task with the results.
 
     Returns:
         An array (7,): 1 for the image, bytes copied to the DPU, bytes copied from it, then the
@@ -80,7 +80,7 @@ def placed_work(placement: Placement, task: Task) -> Array:
 
     Args:
         placement: where each operation of the network runs.
-        task: what the host does with the results.
+        task: the host's task with the results.
 
     Returns:
         An array (7,) as `host_work` returns it.
@@ -92,20 +92,20 @@ def placed_work(placement: Placement, task: Task) -> Array:
         for node in placement.nodes
         if node.op.out_shape is not None and not back.isdisjoint(node.op.outputs)
     }
-    # Of maps with different numbers of channels all is read, as of one whose number is 1.
+    # Maps with different numbers of channels are read completely.
     count = channels.pop() if len(channels) == 1 else 1
     values: float = back_bytes
     # The host skips a box whose score is low. A network is taken for YOLO if all its results have
     # the same number of channels, a multiple of BOXES.
-    if task == "sort" and count % BOXES == 0 and count >= LEAST * BOXES:
+    if task == "sort" and count % BOXES == 0 and count >= LEAST_NUMBERS * BOXES:
         values *= BOXES / count
     return host_work(onto_bytes, back_bytes, values, task)
 
 
 BOXES = 3
-LEAST = 6
-"""Boxes that a pixel of YOLO's maps has in versions 2 to 7, and the least numbers of a box: its
-place and size, a score, and a class.
+LEAST_NUMBERS = 6
+"""The number of boxes of a pixel in the maps of YOLO 2 to 7, and the minimum of numbers for a box:
+four of place and size, a score, and a class.
 """
 
 
@@ -190,13 +190,13 @@ def _plain_work_s(operations: float, moved_values: float, results: float, dpu: D
 
 
 FLOAT_OPERATIONS = {"nearest": 1.0, "linear": 6.0, "cubic": 14.0, "Sigmoid": 20.0, "Tanh": 20.0}
-"""Operations of the host for a value that it enlarges, by the interpolation, or activates: the
-products of rows and columns and their sums, or a hyperbolic tangent (assumed).
+"""Operations of the host for each value, by the interpolation of an enlargement (products of rows
+and columns and their sums) or by the activation (a hyperbolic tangent) (assumed).
 """
 
 
 class FloatWork(NamedTuple):
-    """What the host computes in float of an INT8 network's results, and no rate is published for.
+    """The work of the host in float on an INT8 network's results, for which no rate is published.
 
     Attributes:
         kinds: keys of FLOAT_OPERATIONS.
@@ -212,8 +212,8 @@ def float_interval_s(placement: Placement, task: Task, work: FloatWork, dpu: Dpu
 
     Args:
         placement: where each operation of the network runs. A float file has the operators in it.
-        task: what the host does with the results.
-        work: what the host does around an INT8 network.
+        task: the host's task with the results.
+        work: the work of the host in float around an INT8 network.
         dpu: the configuration, whose board states the processor.
 
     Returns:

@@ -1,10 +1,10 @@
-"""Correct the prediction of a network by runs of other networks on the user's board: by kinship.
+"""Correct the prediction of a network by runs of related networks on the user's board: by kinship.
 
-ln(given / predicted) of a run is the sum of what the runs of one board have in common, the networks
-of one kind of layers, the runs of one network, and the single run. The shares of the variance in
-SHARES were chosen on the published networks, each predicted without its family
-(docs/explanation/cost-model.md). The correction of a network is its mean given the runs, and its
-interval narrows as the variance that they leave (kriging).
+ln(measured / predicted rate) of a run is modelled as a sum of deviations: one that all runs of a
+board have in common, one of networks with the same kinds of layers, one of the network, and one of
+the single run. The shares of the variance in SHARES were chosen on the published networks, each
+predicted without its family (docs/explanation/cost-model.md). The correction of a network is its
+mean given the runs, and its interval narrows with the variance that they leave (kriging).
 """
 
 import math
@@ -31,7 +31,7 @@ def levels_of(operations: Sequence[Operation], dpu: Dpu, bound: str) -> Levels:
     Args:
         operations: the operations of the network, in order.
         dpu: the configuration that the network runs on.
-        bound: what limits the predicted rate, "host" or "DPU".
+        bound: the part that limits the predicted rate, "host" or "DPU".
 
     Returns:
         Four hashes, one for each of SHARES.
@@ -43,7 +43,7 @@ def levels_of(operations: Sequence[Operation], dpu: Dpu, bound: str) -> Levels:
     ]
     network = tuple((kind, op.channels) for kind, op in zip(kinds, computing, strict=True))
     place = (network, dpu.target.name, dpu.name, computing[0].out_shape)
-    # Levels are compared many times: their hashes stand for them.
+    # Hashes, because levels are compared many times.
     return tuple(map(hash, ((dpu.target.name, bound), frozenset(kinds), network, place)))
 
 

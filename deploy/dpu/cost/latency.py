@@ -86,9 +86,9 @@ class Prediction:
         alone_s: time in s of one core's batch on the DPU while the other cores rest.
         layers: the cost of each operation on the DPU, for a batch.
         host_s: time in s of an image on all cores of the host together.
-        task: what the host does with the results.
+        task: the host's task with the results.
         width: half the width of the interval of the rate, in ln(frames per second).
-        bound: what limits the rate, the DPU or the host.
+        bound: the part that limits the rate, the DPU or the host.
         levels: keys of what the network has in common with runs of the user's board (`kinship`).
         speed: the factor by which these runs show the board to be faster than the fitted constants
             say; 1 without runs. All times here are divided by it.
@@ -223,10 +223,10 @@ def predict(
     Args:
         placement: where each node of the network runs.
         dpu: the configuration of a board, with the runs of the user's own board if there are any.
-        task: what the host does with the results; None derives it from the network's operators.
+        task: the host's task with the results; None derives it from the network's operators.
         step_px: number of pixels of an image for which the host computes the consistency step,
             which makes block means of the result agree with the raw image; 0 for no step.
-        float_work: what the host computes in float of the results of an INT8 network.
+        float_work: the work of the host in float on the results of an INT8 network.
 
     Raises:
         ModelError: the DPU refuses a node inside the core, or the network has no convolution.

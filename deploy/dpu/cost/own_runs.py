@@ -1,8 +1,8 @@
 """Runs of a user's own board: `bench --measured board.json` corrects the cost model by them.
 
-A run corrects the prediction of the same network by nearly all of its ratio of given to predicted,
-and that of other networks by less, as `kinship` tells. Runs of another board with the same DPU
-count too.
+A run corrects the prediction of the same network by nearly the whole ratio of the measured to the
+predicted rate, and that of other networks by less (`kinship`). Runs of another board with the same
+DPU count too.
 """
 
 import math
@@ -158,7 +158,7 @@ def read_own_runs(path: Path, dpu: Dpu) -> OwnRuns:
 
 
 def _run(entry: Entry, path: Path, where: str, board: Dpu) -> Run:
-    # onnxruntime's CPU provider runs the file on a processor: its rate says nothing of the DPU.
+    # onnxruntime's CPU provider runs the file on a processor: its rate says nothing about the DPU.
     if entry.provider == "CPUExecutionProvider":
         raise OptionError(
             f"{where} is a run of onnxruntime's CPU provider, not of the board. Measure it with "

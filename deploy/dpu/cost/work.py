@@ -11,22 +11,23 @@ from beers_deploy.dpu.checker.finding import groups_of
 from beers_deploy.dpu.graph import Operation, Shape
 
 FUSED = ("activation", "quantize", "dequantize", "pixel shuffle")
-"""Kinds that cost nothing: done on the way out of the operation before; a pixel shuffle is where
-its results go.
+"""Kinds that cost no time: they are computed while the operation before writes its results, and a
+pixel shuffle only determines where these are written.
 """
 UNSTARTED = ("add", "mul", "concat")
-"""Kinds without a start of their own: behind the operation before, or no more than places."""
+"""Kinds without a start of their own: they follow another operation, or only place its results."""
 BURST_BYTES = 64
-"""The least that the memory moves at a time: eight beats of 64 bit DDR4,
-sixteen of 32 bit LPDDR4.
+"""The bytes that the memory moves at a time, at least: eight beats of 64 bit DDR4, sixteen of 32
+bit LPDDR4.
 """
 AUGMENTATION = 2
-"""Channels of several columns that the array takes in side by side, over input_channel_parallel: up
-to 32 of the DPUCZDX8G and DPUCVDX8G, 64 of the DPUCV2DX8G (Vitis-AI master, targets/*.prototxt).
+"""The number of input channels that the array reads at a time from several columns, over
+input_channel_parallel: up to 32 in the DPUCZDX8G and DPUCVDX8G, 64 in the DPUCV2DX8G (Vitis-AI
+master, targets/*.prototxt).
 """
 SHARING = 2
-"""Readers of one result up to which the DPU keeps it; with more of them it
-passes through memory.
+"""The maximum number of readers of a result that the DPU keeps; for more, it passes through
+memory.
 """
 
 

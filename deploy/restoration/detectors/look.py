@@ -225,7 +225,7 @@ def sentences(bands: Sequence[BandFaults], advise_fix: bool = True) -> list[str]
 
     Args:
         bands: the faults of each band, in the order of the bands.
-        advise_fix: whether to recommend that faults are found and replaced.
+        advise_fix: True to recommend that faults are found and replaced.
     """
     messages = []
     for number, band in enumerate(bands, 1):

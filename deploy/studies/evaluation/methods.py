@@ -66,7 +66,7 @@ class Method:
     Attributes:
         name: the name in tables.
         restore: the function from degraded to restored digital numbers, (H, W) each.
-        sensor_known: what the method knows of the sensor, in words: known, blind or another one.
+        sensor_known: the knowledge of the sensor, in words: known, blind or another one.
         specialise: returns the function `restore` of the same method for another sensor; None if
             the method does not depend on a sensor, or always assumes the same one.
     """
