@@ -67,15 +67,20 @@ def arguments() -> argparse.Namespace:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="of the provider; repeatable",
+        help="option of the provider; repeat it for several",
     )
     add("--configuration", default="C32B3", help="DPU in the board's bitstream, C32B1 to C64B5")
-    sides = "tile side in image pixels; if none, that of host.json next to the model, or 640"
+    sides = "tile side in image pixels; by default that of host.json next to the model, or 640"
     add("--tile", type=count, help=sides)
     add("--batch", type=count, default=1, help="tiles in one call")
     add("--frames", type=count, default=300, help="tiles to time, after a warm-up")
-    add("--threads", type=count, default=1, help="calls in flight; try 1, 2, 3, ... batch handlers")
-    power = "microwatts, such as hwmon's power1_input; repeatable, summed"
+    add(
+        "--threads",
+        type=count,
+        default=1,
+        help="calls in flight; at most one for each batch handler",
+    )
+    power = "file of the power in microwatts, such as hwmon's power1_input; repeat it to add more"
     add("--power-file", type=Path, action="append", default=[], help=power)
     add("--no-compare", action="store_true", help="skip the comparison with the CPU provider")
     return parser.parse_args()
