@@ -105,8 +105,8 @@ def networks_of(
             logger.warning(warning)
     elif is_unknown(sensors):
         logger.info(
-            "network: %s, for an unknown sensor: the result may be worse than the image if yours "
-            "is sharper or noisier than assumed. Name it with `sensor`",
+            "network: %s, for an unknown sensor: the result may be worse than the image if your "
+            "sensor is sharper or noisier than assumed. Name it with `sensor`",
             first.name,
         )
     else:

@@ -311,9 +311,9 @@ def plan_for(network: Network, shape: tuple[int, int, int], tiles: Tiles) -> Pla
     tile_px = tiling.fixed_px or tiles.side_px
     if tiling.fixed_px is not None and tile_px > min(tiles.side_px, height_px, width_px):
         raise OptionError(
-            f"The network is fixed to tiles of {tile_px} px. Neither the image, which has "
-            f"{width_px} x {height_px} pixels, nor `tile`, which is {tiles.side_px} px, may be "
-            "smaller."
+            f"The network is fixed to tiles of {tile_px} px, but the image has {width_px} x "
+            f"{height_px} pixels and `tile` is {tiles.side_px} px. Neither may be smaller: give a "
+            "larger image or `tile`, or export the network for any size."
         )
     is_one_tile = shape[1:] == (tiling.fixed_px, tiling.fixed_px)
     if not tiling.reads_whole or tiles.halo.isdecimal():

@@ -16,7 +16,7 @@ from beers_deploy.profiles.validation import CONFIG, Amount, Share
 
 def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
     if ends[0] > ends[1]:
-        raise ValueError(f"must have its lower end first, got {list(ends)}. Exchange the two.")
+        raise ValueError(f"must have its lower end first, got {list(ends)}. Swap the two.")
     return ends
 
 

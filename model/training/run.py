@@ -258,7 +258,7 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
     patches = PatchSource(train_on, run.patches, recipe.batch, recipe.seed, *ranks, trainer.device)
     if patches.unused and worker.first:
         logger.warning(
-            "%d of the %d training images are too small for a patch of %d px and teach nothing, "
+            "%d of the %d training images are too small for a patch of %d px and are not used, "
             "such as %s",
             len(patches.unused),
             len(train_on),

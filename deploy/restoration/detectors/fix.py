@@ -101,14 +101,14 @@ def require_neighbours(faults: FaultList, raster: Raster) -> None:
         valid[np.array(places, int)] = False
         if not valid.any():
             raise OptionError(
-                f"`fix_detectors` has all of {counted(size_px, name)} as faulty, so no pixel is "
-                "left to interpolate from. List the faulty ones alone."
+                f"`fix_detectors` lists all of {counted(size_px, name)} as faulty, so no pixel is "
+                "left to interpolate from. List only the faulty ones."
             )
         reached = binary_dilation(valid, np.ones(2 * REACH_PX + 1))
         if stay := int(np.count_nonzero(~reached)):
             logger.warning(
-                "look at the detectors: %s without a valid one within %d px, left as they are: "
-                "mark these pixels as nodata",
+                "check the detectors: %s cannot be replaced, because no valid one is within %d px. "
+                "Mark these pixels as nodata",
                 counted(stay, f"faulty {name}"),
                 REACH_PX,
             )

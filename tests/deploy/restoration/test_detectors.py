@@ -188,7 +188,7 @@ def test_sentences_name_kind_place_and_remedy() -> None:
     pixels[:, ::2] *= 1.04
     clipped = np.rint(np.minimum(pixels, 4095)).astype(np.uint16)
     lines = sentences(look_at_detectors(source_of(clipped), 5000))
-    assert all("look at the detectors: " in sentence for sentence in lines)
+    assert all("check the detectors: " in sentence for sentence in lines)
     for words in (
         "1 dead column",
         "column 40",
@@ -244,7 +244,7 @@ def test_a_restoration_sees_the_replaced_pixels(image: Path, model: Path, tmp_pa
     run(clean, out, fix_detectors=str(listed))
     assert_array_equal(tifffile.imread(out), expected)
     shown = done(f"restore {image} --dry-run --network {model}")
-    assert "look at the detectors: 1 dead column" in shown
+    assert "check the detectors: 1 dead column" in shown
     assert "dead lines" in shown
 
 
@@ -290,7 +290,7 @@ def test_columns_without_a_valid_one_in_reach_are_counted_and_all_of_them_refuse
     assert not caplog.records
     require_neighbours(FaultList(tuple(wide)), raster)
     # On the left there is no valid column at all.
-    assert f"{REACH_PX + 3} faulty columns without" in caplog.text
+    assert f"{REACH_PX + 3} faulty columns cannot be replaced" in caplog.text
     every = tuple(Fault(column, -1) for column in range(WIDTH))
     with pytest.raises(OptionError, match=f"all of {WIDTH} columns as faulty"):
         require_neighbours(FaultList(every), raster)

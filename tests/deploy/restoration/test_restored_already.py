@@ -117,7 +117,7 @@ def test_the_command_warns_and_goes_on(tmp_path: Path) -> None:
     tifffile.imwrite(image, PROCESSED["smoothed"](raw(1)))
     output = done(f"restore {image} {out} --network {NETWORK}")
     assert f"network: {NETWORK}, for an unknown sensor" in output
-    assert "if yours is sharper or noisier than assumed" in " ".join(output.split())
+    assert "if your sensor is sharper or noisier than assumed" in " ".join(output.split())
     assert "look at the image: it looks restored already" in output
     assert out.exists()
     again = f"restore {image} {out} --overwrite --network {NETWORK}"
