@@ -72,16 +72,16 @@ def bench(
 
     Args:
         network: ONNX network, or a shipped name, which stands for its INT8 file; convbeers-s-int8
-            if none.
+            by default.
         target: board whose model predicts: name, also with -model behind it, or .toml file; several
             with commas, or all. An NPU has published figures only; 'host' measures on this machine.
         sensor: sensor of a shipped network: name, .toml file or blind.
-        image: mono image of at most 12 bits that is the swath; its exposures are counted.
-        full_scale: full scale of the image; 4095 if none.
-        size: width x height of the swath in pixels; 13600x9016 if none.
+        image: image of the swath, of one band and at most 12 bits, to count its exposures.
+        full_scale: full scale of the image; 4095 by default.
+        size: width x height of the swath in pixels; 13600x9016 by default.
         tile: side of a tile in pixels; several with commas are compared.
         halo: context around each tile in pixels, or 'exact' (no seams).
-        dpu: configuration of the DPU, such as C32B3; all compares those of the board.
+        dpu: configuration of the DPU, such as C32B3; all compares all of the board.
         host_task: work of the host on the results, if the file does not state it: argmax and
             softmax find the best class, sort finds boxes, image adds an image, copy reads only.
         measured: JSON list of runs on your board, which correct the cost model.

@@ -38,12 +38,12 @@ def characterize(
         images: raw images of one sensor at one setting, or folders of them: integers, one band. In
             Python also arrays (H, W).
         out: sensor profile to write, a .toml file.
-        edge: box with one straight edge, FILE:X,Y,WIDTH,HEIGHT; edges are searched for if none.
+        edge: box with one straight edge, FILE:X,Y,WIDTH,HEIGHT; searched for by default.
         mtf: contrast at Nyquist across the track, or across and along it, if you know it: 0.07 is 7
-            %; measured if none.
-        black_level: pixel value of the dark; assumed to be 0 if none.
-        bits: bits of a pixel; found from clipped pixels if none.
-        gain: DN per W/m2/sr/um; full scale is assumed to be 400 W/m2/sr/um if none.
+            %; measured by default.
+        black_level: pixel value of the dark; assumed to be 0 by default.
+        bits: bits of a pixel; found from clipped pixels by default.
+        gain: DN per W/m2/sr/um; by default full scale is assumed to be 400 W/m2/sr/um.
         gsd: ground sampling distance in m; no pixel depends on it.
         overwrite: replace the profile if it exists.
         progress: a function that is called at each step, False for silence, None for a bar or lines

@@ -27,11 +27,11 @@ def check(
 
     Args:
         network: ONNX network: float, INT8 or the core for a board; or a shipped name, which stands
-            for its INT8 file; convbeers-s-int8 if none.
+            for its INT8 file; convbeers-s-int8 by default.
         target: board or NPU whose rules count: name or .toml file.
-        dpu: configuration of the DPU, such as C32B3; the board's default if none.
+        dpu: configuration of the DPU, such as C32B3; by default that of the board.
         tile: side of a tile in pixels; the network's own if it has one, else 640.
-        output: name of the output to keep of a network that has several; all if none.
+        output: name of the output to keep of a network that has several; all by default.
 
     Returns:
         A table of devices, refusals and nodes. It is true if the DPU runs its part whole.

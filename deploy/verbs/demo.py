@@ -38,9 +38,9 @@ def demo(
     """Simulate, gate, check, restore and predict one scene, and write a report.
 
     Args:
-        image: raw 12-bit image, or an 8-bit photograph as the scene; a drawn scene if none.
-        full_scale: full scale of a raw image; 4095 if none, needed for 0..1.
-        sensor: 12-bit sensor of the raw image, or to simulate: name or .toml file.
+        image: raw 12-bit image, or an 8-bit photograph as the scene; a drawn scene by default.
+        full_scale: full scale of a raw image; 4095 by default. Needed for 0..1.
+        sensor: 12-bit sensor of the raw image or of the simulation: name or .toml file.
         out: folder for report.html and files.
         seed: seed of every random draw.
         progress: a function that is called at each step, False for silence, None for a bar or lines

@@ -71,13 +71,13 @@ def evaluate(
 
     Args:
         methods: names, separated by commas: degraded is always a row. Shipped networks and the
-            traditional methods use the sensor; NAME@blind is given none, NAME@SENSOR another one.
+            traditional methods use the sensor; NAME@blind uses none, NAME@SENSOR another one.
             In Python also a mapping of names to networks or functions of an image (H, W).
-        images: folder of scenes to simulate from; drawn scenes if none.
+        images: folder of scenes to simulate from; drawn scenes by default.
         pairs: folder with degraded/ and reference/, as 'simulate' writes it; in Python also pairs.
-        sensor: sensor of the degraded images: name or .toml file; of pairs the one that made them,
-            else pleiades-degraded if none. With a detector several, separated by commas.
-        reference: sensor of the reference images; pleiades-reference if none.
+        sensor: sensor of the degraded images: name or .toml file; by default the one that made the
+            pairs, or pleiades-degraded. With a detector several, separated by commas.
+        reference: sensor of the reference images; pleiades-reference by default.
         lpips: weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.
         out: folder for report.html and pictures.
         calibrate: copy of the network's file to write, with the interval of 'restore --interval'
@@ -88,12 +88,12 @@ def evaluate(
             0.25,0.05.
         bits_per_pixel: also compare restoration before and after JPEG 2000 compresses to this
             number of bits per pixel; several with commas.
-        consistency: networks that are given the sensor agree with the image at low frequencies, and
-            the dark is smoothed.
-        exposure: shipped networks restore dark parts and strong edges at other exposures.
-        strict: refuse pairs whose pixels contradict the sensor, instead of a warning.
-        detector: ONNX detector as Ultralytics exports it, which is shown the labelled images.
-        labels: folder of VOC labels, or COCO's .json, of the images; next to them if none.
+        consistency: make results agree with the image at low frequencies, and smooth dark parts, if
+            the sensor is given.
+        exposure: restore dark parts and strong edges at other exposures (shipped networks).
+        strict: fail instead of warning if pairs contradict the sensor.
+        detector: ONNX detector as Ultralytics exports it, to run on the labelled images.
+        labels: folder of VOC labels, or COCO's .json, of the images; next to them by default.
         split: use only the pictures that a list in the folder names, such as test.
         side: side of the detector's input in pixels, if its file leaves it open.
         classes: labelled classes by the detector's names: car=vehicle,minibus=vehicle.

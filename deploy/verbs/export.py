@@ -41,16 +41,16 @@ def export(
         out: ONNX file to write.
         network: a shipped name, also with -int8; weights (.safetensors); or an INT8 file that
             'quantize' made.
-        sensor: sensor of the network: name, .toml file or blind; pleiades-degraded if none.
+        sensor: sensor of the network: name, .toml file or blind; pleiades-degraded by default.
         tile: side in pixels of the one tile that the input is fixed to, such as 640.
         board_file: also write the core of an INT8 network in the board's encoding: QDQ ONNX, of an
             NPU VINT8.
         c: also write the core of an INT8 network as a C99 file for one tile, with integers only.
         target: board or NPU of `board_file`: name or .toml file.
-        delta: also write what the sensor changes in an INT8 network, 1 to 3 kB; and NAME-x4.delta
-            and so on for the exposures of 'restore', as far as the noise allows.
-        apply: condition the INT8 network on the sensor of this delta, in place of `sensor`: that
-            sensor's file, to the byte.
+        delta: also write the sensor's changes to an INT8 network, 1 to 3 kB; and NAME-x4.delta and
+            so on for the exposures of 'restore', as far as the noise allows.
+        apply: apply this delta to the INT8 network, instead of `sensor`. The result is the file of
+            that sensor, byte for byte.
 
     Returns:
         The path of the ONNX file.

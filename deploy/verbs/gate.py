@@ -54,17 +54,17 @@ def gate(
 
     Args:
         float_network: float ONNX or weights. The name of a shipped pair stands for both;
-            convbeers-s if none. In Python an INT8 network that was quantised in this process
+            convbeers-s by default. In Python an INT8 network that was quantised in this process
             stands for both too.
-        int8_network: its INT8 ONNX; that of the shipped pair if none.
-        max_mae: largest mean absolute difference, as a share of full scale; 0.0007 if none.
+        int8_network: its INT8 ONNX; that of the shipped pair by default.
+        max_mae: largest mean absolute difference, as a share of full scale; 0.0007 by default.
         limits: TOML file of limits by name; others have their defaults. In Python also a mapping.
         baseline: JSON file of an earlier gate that passed on the same patches: the MAE may not
             grow.
         target: board or NPU whose rules count: name or .toml file.
         sensor: sensor of the simulated patches, and of a network that is conditioned on one: name
             or .toml file.
-        images: folder of scenes to simulate from; drawn scenes if none.
+        images: folder of scenes to simulate from; drawn scenes by default.
         samples: your own samples in place of simulated patches: .npy or .npz (N, C, H, W), or a
             folder of images; in Python also arrays.
         patches: number of simulated patches of 128 x 128 pixels.

@@ -16,7 +16,7 @@ def profiles(name: ProfileName | None = None, *, toml: bool = False) -> "Table |
     docs/reference/sensor-profile.md has the keys of a sensor's file, with units and ranges.
 
     Args:
-        name: a shipped profile, or a .toml file; all are listed if none.
+        name: a shipped profile, or a .toml file; all are listed by default.
         toml: print the file itself, to start your own from.
 
     Returns:

@@ -88,7 +88,7 @@ def quantize(
             or an iterable of these such as a DataLoader.
         input_range: LOW,HIGH of the values that the network reads, or such a pair for each channel,
             as 0,1,0,50; [0, 1] for channels whose samples lie in it, else what the samples span.
-        images: folder of scenes to simulate from; drawn scenes if none.
+        images: folder of scenes to simulate from; drawn scenes by default.
         patches: number of simulated patches.
         patch: side of a simulated patch in pixels.
         effort: how thoroughly channels are equalised: fast takes first guesses, normal searches

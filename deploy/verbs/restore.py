@@ -77,7 +77,7 @@ def restore(
             (bands, H, W) of NumPy, torch, Dask or xarray, or a dataset of rasterio.
         out: TIFF to write.
         network: ONNX network, or a shipped name (NAME in float32, NAME-int8 in INT8);
-            convbeers-s-int8 if none.
+            convbeers-s-int8 by default.
         method: a network, or the traditional pipeline, which takes about a minute for a megapixel
             and cannot be resumed.
         quality: quality of the traditional pipeline.
@@ -85,17 +85,17 @@ def restore(
             name or .toml file; B0=a.toml,B1=b.toml for each band; blind if unknown.
         tile: longest side of a tile in pixels.
         halo: context around each tile in pixels, or 'exact' (no seams).
-        full_scale: pixel value that is full scale; else what the image states, the bits of the
-            sensor, or 12 bits. 8-bit and 0..1 pixels need it.
+        full_scale: pixel value at full scale; by default from the image, the bits of the sensor,
+            or 12 bits. Needed for 8-bit and 0..1 pixels.
         nodata: value of missing pixels of an array; a file states its own.
         runtime: library that runs the network; openvino is 1.0 to 1.9 times as fast.
         threads: threads of the runtime; 0 uses all cores, or one for each thread of a scheduler's
             workers.
         compression: lossless compression of the output.
-        memory: budget of this process in GB; what is free if none.
+        memory: budget of this process in GB; the free memory by default.
         scheduler: address of a Dask scheduler whose workers run the network, such as
             tcp://host:8786.
-        cog: write a Cloud-Optimised GeoTIFF, with overviews and what was done.
+        cog: write a Cloud-Optimised GeoTIFF, with overviews and a record of the processing.
         stac: STAC item of the output to write; needs `cog`.
         self_check: TIFF to write: for each block of 64 x 64 pixels, whether the result, blurred as
             the sensor blurs, agrees with the image.
@@ -104,14 +104,14 @@ def restore(
             such an interval, as shipped ones have. In Python an array returns (restored,
             half_width).
         view: HTML file to write, which compares raw and restored in a browser.
-        strict: refuse what contradicts the sensor or fails the self-check, instead of a warning.
-        consistency: make the result agree with the image at low spatial frequencies, and smooth the
-            dark, if the sensor is named.
+        strict: fail instead of warning if the image contradicts the sensor or fails the self-check.
+        consistency: if the sensor is named, make the result agree with the image at low spatial
+            frequencies, and smooth dark parts.
         exposure: restore dark parts and strong edges at other exposures (shipped networks).
         fix_detectors: interpolate faulty pixels first: 'found' searches for them and lists them
-            next to the output; or a list, lines of column,row with * for a whole column.
+            next to the output; or a file that lists column,row by lines, with * for a whole column.
         force: accept an image that was restored before, follow an index out of its folder, and
-            write any result.
+            write even implausible results.
         overwrite: replace the output if it exists.
         resume: continue a run that was stopped or killed.
         dry_run: print facts of the image, the plan of tiles and the expected time, and write no
@@ -120,7 +120,7 @@ def restore(
             on standard error.
 
     Returns:
-        Of an array the restored one, of the same kind, type and scale. Of a file a table of the
+        For an array the restored one, of the same kind, type and scale. For a file a table of the
         run, with the `path` and the `time_s`.
 
     Raises:

@@ -79,15 +79,15 @@ def simulate(
 
     Args:
         images: scenes: image files, or folders of them, of 8 bits, 16-bit DN or float radiance;
-            repeat it for several. In Python also the pixels of one. A drawn scene if none.
-        out: folder of the data set; in Python one pair is returned if none.
+            repeat it for several. In Python also the pixels of one. A drawn scene by default.
+        out: folder of the data set; in Python one pair is returned by default.
         sensor: sensor of the degraded images, whose ranges are drawn from: name or .toml file;
-            pleiades-degraded if none.
-        reference: sensor of the reference images; pleiades-reference if none.
+            pleiades-degraded by default.
+        reference: sensor of the reference images; pleiades-reference by default.
         preset: data set of the paper: its sensor and its patch size.
         size: side in pixels of the pair of a drawn scene, in Python.
-        patch: side of a patch in pixels; whole scenes if none.
-        oversampling: number of scene pixels for each pixel; the sensor's if none.
+        patch: side of a patch in pixels; whole scenes by default.
+        oversampling: number of scene pixels for each pixel; the sensor's by default.
         scene: scene whose light and effects are applied, such as night-port, or a .toml file.
         with_: effect to add, at typical values; repeat it for several.
         without: effect to leave out; repeat it for several.
@@ -198,7 +198,9 @@ def _recipe(
     ratio = math.ceil(scene_ratio)
     if ratio < MIN_RATIO:
         logger.warning(
-            "at %d scene pixel for a pixel the blur itself rings near sharp edges", ratio
+            "at %d scene pixel for each pixel, the simulated blur itself rings near sharp edges: "
+            "give scenes of a higher resolution",
+            ratio,
         )
     return DatasetRecipe(
         tuple(scenes),

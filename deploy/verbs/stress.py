@@ -47,22 +47,22 @@ def stress(
 ) -> "Table":
     """Run hard cases through a network in float32, in INT8, in integers alone and in tiles.
 
-    The tables show what holds, the worst measurements, known limitations that were met, and which
-    sums are proven not to overflow. The command exits with 1 if something fails. `bit_flips` shows
-    what flipped bits in weights, shifts, feature maps and the image cost, and what guards gain and
-    cost on the board.
+    The tables show which checks hold, the worst measurements, known limitations that were met, and
+    which sums are proven not to overflow. The command exits with 1 if something fails. `bit_flips`
+    shows the loss by flipped bits in weights, shifts, feature maps and the image, and the gain and
+    cost of guards on the board.
 
     Args:
         float_network: float ONNX or weights. The name of a shipped pair stands for both;
-            convbeers-s if none.
-        int8_network: its INT8 ONNX; that of the shipped pair if none.
+            convbeers-s by default.
+        int8_network: its INT8 ONNX; that of the shipped pair by default.
         cases: only these cases, separated by commas, such as night,snow.
         stages: only these stages, separated by commas, such as float32,INT8.
         side: side of the images in pixels, if a case has none of its own.
         bit_flips: inject bit flips into the INT8 network instead of running hard cases.
         draws: number of injections into each memory at each rate.
         sensor: sensor of a shipped network, and of the patches for bit flips: name or .toml file.
-        images: folder of aerial images for the patches for bit flips; drawn scenes if none.
+        images: folder of aerial images for the patches for bit flips; drawn scenes by default.
         target: board whose cost model predicts the cost of the guards: name or .toml file.
         seed: seed of every random draw.
         out: tables as Markdown; with `bit_flips` the curves are written next to it as SVG.

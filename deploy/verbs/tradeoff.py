@@ -62,15 +62,15 @@ def tradeoff(
 
     Args:
         out: folder of the page and the figures.
-        images: folder of scenes to simulate from; drawn scenes if none.
+        images: folder of scenes to simulate from; drawn scenes by default.
         sensor: sensor of the degraded images: name or .toml file.
-        reference: sensor of the reference images; pleiades-reference if none.
+        reference: sensor of the reference images; pleiades-reference by default.
         network: separated by commas: shipped names, INT8 files, or float ONNX or safetensors files,
             which are quantised on the way; all stands for the shipped ones.
         budget: what you can afford, such as latency<=9s,power<=20W. The best PSNR wins.
         need: what you must reach, such as psnr>=44. Without a budget the least latency wins.
         lpips: weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.
-        calibration: folder of scenes to quantise your networks on; drawn scenes if none.
+        calibration: folder of scenes to quantise your networks on; drawn scenes by default.
         target: board whose model predicts: name or .toml file; several with commas, or all.
         size: width x height of the swath in pixels.
         dry_run: print how much is measured and about how long that takes, and write nothing.

@@ -77,11 +77,11 @@ def train(
             it for several.
         pairs: folder of pairs that 'simulate' wrote, in place of images.
         variant: size of the network.
-        sensor: sensor of the degraded images: name or .toml file; of pairs the one that made them,
-            else pleiades-variable if none.
-        conditioned: condition the network on sensors of a wide range with that gain: it becomes the
-            network of any sensor in range.
-        reference: sensor of the reference images; pleiades-reference if none.
+        sensor: sensor of the degraded images: name or .toml file; by default the one that made the
+            pairs, or pleiades-variable.
+        conditioned: train for a wide range of sensors with the gain of `sensor`. The network can
+            then be conditioned on any sensor in range.
+        reference: sensor of the reference images; pleiades-reference by default.
         drawn: number of drawn scenes to add to the images.
         steps: number of gradient steps.
         batch: number of patches for each step and worker.
