@@ -90,7 +90,7 @@ def judged(
             radiance = float(name.split()[2])
             truths[name] = radiance / sensor.noise_sigma(radiance)
         if name in truths and figure.value is not None and figure.interval is not None:
-            # Both axes, and both radiances, count as one row.
+            # Both axes count as one row, and so do both radiances.
             row = "SNR" if name.startswith("SNR") else f"MTF {name.split(maxsplit=2)[2]}"
             yield row, figure.value, figure.interval, truths[name]
 

@@ -34,7 +34,7 @@ def __getattr__(name: str) -> Any:
     try:
         return _loaded(name)
     except ImportError as error:
-        # This loads NumPy, which `__main__` has to survive without.
+        # This loads NumPy, and `__main__` must run without it.
         from beers_deploy.profiles.errors import missing_extra
 
         raise missing_extra(error, name) from error

@@ -114,7 +114,7 @@ class Data:
     @property
     def simulated(self) -> "Calibration":
         """The simulator of the patches that `sensor`, `images`, `patches` and `seed` define."""
-        # This loads SciPy, which samples of one's own do without.
+        # This loads SciPy, which a user's own samples do not need.
         from beers_deploy.quant.samples.simulated import Calibration
 
         return Calibration(self.sensor, self.images, self.patches, self.patch_px, self.seed)
@@ -203,7 +203,7 @@ def compared(
     """
     notes = []
     if own is None:
-        # This loads SciPy, which samples of one's own do without.
+        # This loads SciPy, which a user's own samples do not need.
         from beers_deploy.quant.samples.simulated import unseen_patches
 
         patches = unseen_patches(data.sensor, data.images, data.patches, data.seed)

@@ -72,7 +72,7 @@ def export_float(path: Path, out: Path, sensor: SensorLike | None, tile: int | N
         save_onnx(model, out)
         logger.info("wrote %s", out)
         return
-    # It loads torch, which shipped networks do without.
+    # This loads torch, which shipped networks do not need.
     from beers_deploy.parity import require_parity, torch_network
 
     reference = torch_network(path, profile.nominal() if profile else None)

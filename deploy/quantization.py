@@ -333,7 +333,7 @@ def family_model(
         The ONNX model for the sensor in the middle of the family. `int8_for_sensor` makes that of
         another sensor from it.
     """
-    # This loads SciPy, which samples of one's own do without.
+    # This loads SciPy, which a user's own samples do not need.
     from beers_deploy.model.simulator.procedural import load_scenes
     from beers_deploy.quant.sensor_bank.calibrate import bank_images, quantize_behind_bank
 

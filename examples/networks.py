@@ -335,7 +335,7 @@ def to_onnx(name: str, network: nn.Module, fold: bool = True, opset: int = 17) -
         **axis_options,
     }
     with warnings.catch_warnings():
-        # The newer exporter wants onnxscript, a package more; this one is what most of today's
+        # The newer exporter requires onnxscript, another package; this one is what most of today's
         # files come from.
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.onnx.export(network, (image,), file, dynamo=False, **how)  # type: ignore[arg-type]

@@ -104,8 +104,8 @@ class Bank:
         numbers of 12 bits. The gain is sigma / SIGMA within GAINS, rounded to eighths, so that the
         single weight of the image is an integer: no duplicated channel corrects its rounding.
         """
-        # In eighths the image's one weight is an integer in INT8. No copy would correct its
-        # rounding.
+        # In eighths, the single weight of the image is an integer in INT8. No copy would correct
+        # its rounding.
         return float(np.clip(np.rint(8 * self.sigma / SIGMA) / 8, *GAINS))
 
     def reach(self, kernels: Kernels) -> tuple[float, float]:
@@ -217,7 +217,7 @@ def fitted_kernel(gain: NDArray[np.inexact], power: Array, r_squared: Array) -> 
         r_squared: the squared frequency r^2 at them, (GRID, GRID).
     """
     weights = np.zeros_like(power)
-    # At frequency 0 the weight is infinite. The equation for the sum stands for it below.
+    # At frequency 0 the weight is infinite. The equation of the sum below replaces it.
     weights[r_squared > 0] = power[r_squared > 0] / r_squared[r_squared > 0]
     correlation = np.fft.ifft2(weights).real
     restoration = np.fft.ifft2(weights * gain).real

@@ -244,8 +244,8 @@ class BankedConvBEERS(Layers):
         kernels = condition.filters.flatten(0, 1)[:, None]
         filtered = conv2d(padded, kernels, groups=len(image))
         filtered = filtered.view(len(image), -1, *image.shape[-2:])
-        # Both are clipped to `Bank.reach`, which is where int8 ends, so that a network trains with
-        # what INT8 will show it.
+        # Both are clipped to `Bank.reach`, where int8 ends, so that a network trains with the input
+        # that INT8 gives it.
         planes = filtered[:, :FILTERS]
         analytic = filtered[:, FILTERS:]
         if self.kernels == "cut":

@@ -49,7 +49,7 @@ def draw_table(across: float, along: float, generator: np.random.Generator) -> M
     smear_px = float(generator.choice([0.0, generator.uniform(0, LONGEST_SMEAR_PX)]))
     detector = np.sinc(FREQUENCIES)
     motion = np.sinc(smear_px * FREQUENCIES)
-    # Optics take contrast away and add none, however much the motion has taken.
+    # Optics only reduce contrast, however much the motion has reduced it.
     contrast_along = min(along / float(detector[-1] * motion[-1]), 1.0)
     curves = (
         optics(across / float(detector[-1])) * detector,
@@ -83,7 +83,7 @@ def pupil_contrast(contrast: float, obscuration: float) -> Curve:
     Its cut-off frequency is chosen such that the contrast at Nyquist is `contrast`.
     """
     frequency, contrasts = _pupil(obscuration)
-    # It falls, but for rounding: read backwards it can be searched.
+    # It falls, except for rounding, so it can be searched backwards.
     at_nyquist = float(np.interp(contrast, contrasts[::-1], frequency[::-1]))
     return np.interp(FREQUENCIES / NYQUIST * at_nyquist, frequency, contrasts)
 

@@ -67,7 +67,7 @@ class DatasetRecipe:
     radiance_scale: float = 1.0
     seed: int = 0
     tolerance_dn: float = TOLERANCE_DN
-    # Scenes are resampled by it first, where the wanted ratio is no whole number.
+    # The factor by which scenes are resampled first, if the wanted ratio is not an integer.
     scene_scale: float = 1.0
 
     def to_json(self) -> dict[str, object]:
@@ -236,7 +236,7 @@ def write_dataset(
     Returns:
         The number of patches, and the share of drawn SNR pairs that were impossible and redrawn.
     """
-    # First of all, so that a scene that cannot be read is refused before anything is written.
+    # This comes first, so that a scene that cannot be read is refused before anything is written.
     windows = plan_windows(recipe)
     _check_folder(recipe, out, resume)
     _remove_left_overs(out)

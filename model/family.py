@@ -64,8 +64,7 @@ def sensor_values(sensor: Instrument) -> dict[str, float]:
     They are its MTF at Nyquist across and along the track, including smear, and its noise in dark
     and in bright ground as a share of full scale, including rounding to integers.
     """
-    # A network knows no smear of its own: what that leaves of the contrast along the track is
-    # counted there.
+    # Networks have no input for smear. Its loss of contrast along the track is included there.
     smear_contrast = abs(float(np.sinc(0.5 * sensor.smear_px)))
     sigmas = [noise_over_full_scale(sensor, part) for part in (16, 4)]
     across, along = sensor.mtf_axes

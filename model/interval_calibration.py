@@ -156,7 +156,8 @@ def fit_exponents(samples: Sequence[Sample]) -> Exponents:
     logarithms_of_errors = np.log(np.maximum(errors, LEAST_ERROR))
     sizes = [sample.error.size for sample in samples]
     weight = np.repeat(1 / (np.array(sizes) * len(sizes)), sizes)
-    # Centred, what is the same in all samples is 0, and the last unknown alone is the level.
+    # After centring, terms that are equal in all samples are 0, and only the last unknown is the
+    # level.
     columns = np.append(columns - weight @ columns, np.ones((weight.size, 1)), axis=1)
 
     def loss_and_gradient(unknowns: Array) -> tuple[float, Array]:
@@ -166,8 +167,8 @@ def fit_exponents(samples: Sequence[Sample]) -> Exponents:
         share_beyond = (1 + np.tanh(beyond / (2 * SMOOTHING))) / 2
         return float(loss), -(weight * (share_beyond - (1 - FITTED_SHARE))) @ columns
 
-    # Terms that one sensor leaves proportional have no solution of their own: from 0, where the
-    # steps begin, each grows with its size.
+    # Terms that are proportional for one sensor have no unique solution. From 0, where the steps
+    # begin, each grows with its size.
     start = np.zeros(columns.shape[1])
     tolerances = {"ftol": 1e-12, "gtol": 1e-8}
     fitted = minimize(loss_and_gradient, start, jac=True, method="L-BFGS-B", options=tolerances)

@@ -56,7 +56,7 @@ def matching_lines(out: Path, files: Iterable[Path]) -> dict[tuple[int, str], st
     for path in files:
         if not path.is_file():
             continue
-        # A byte that is no UTF-8 spoils its own line alone, whose digest then does not match.
+        # A byte that is not valid UTF-8 spoils only its own line, whose digest then does not match.
         for text in path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True):
             line = _matching(out, text)
             if line is not None:

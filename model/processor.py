@@ -70,7 +70,8 @@ def asked(runtime: str, convolve: Convolve) -> bool:
     import numpy as np
     from onnx import TensorProto, helper, numpy_helper
 
-    # One window over the whole image, all weights largest, the sum scaled to RESULT.
+    # One window over the whole image, with all weights at their maximum and the sum scaled to
+    # RESULT.
     weight = np.full((CHANNELS, CHANNELS, SIDE_PX, SIDE_PX), WEIGHT, np.int8)
     values = {
         "one": np.float32(1),

@@ -152,7 +152,7 @@ class Steps:
         elif self._task is not None and Display.bar is not None:
             Display.bar.update(self._task, completed=self.done, description=one_line(text))
         elif sink is not False:
-            # A plain line is due now and then, and at the end of outer work.
+            # A plain line is written from time to time, and at the end of outer work.
             now = time.monotonic()
             ends = self.total is None or (self.done >= self.total and not self._nested)
             if ends or now - self._printed > LINE_EVERY_S:

@@ -44,7 +44,7 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             return {name: np.asarray(archive[name]) for name in archive.files}
     except (AttributeError, ImportError, NameError):
-        # NumPy was called in a way that it does not know, whatever the file holds.
+        # NumPy was called with an argument that it does not have, whatever the file contains.
         raise
     except MemoryError:
         raise ValueError("an array does not fit into memory") from None

@@ -332,10 +332,10 @@ def _spread(excess: np.ndarray, length_px: float) -> np.ndarray:
     # A length near 0 reaches no neighbour.
     with np.errstate(over="ignore"):
         kernel = np.exp(-distance / length_px) * (distance > 0)
-    # So short that not even a neighbour is reached.
+    # The length is so short that not even a neighbour is reached.
     if kernel.sum() == 0:
         return np.zeros_like(excess)
-    # It takes a sixth of a second to load, for what few sensors have.
+    # Loading SciPy takes a sixth of a second, and few sensors need it.
     from scipy.ndimage import convolve1d
 
     return np.asarray(convolve1d(excess, kernel / kernel.sum(), axis=-2, mode="constant"))

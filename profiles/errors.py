@@ -212,7 +212,8 @@ def missing_extra(error: ImportError, where: str) -> Exception:
         does not load; otherwise `error` itself.
     """
     # The package whose import failed, by the module's name or by the code that imported it. Python
-    # runs the top level of a module under this name: a fault within a function is no failed import.
+    # runs the top level of a module under this name. An ImportError within a function is no failed
+    # import.
     at_import = (
         frame for frame, _ in walk_tb(error.__traceback__) if frame.f_code.co_name == "<module>"
     )

@@ -66,7 +66,7 @@ Numbers = tuple[Annotated[float, Field(strict=True, allow_inf_nan=False)], ...]
 
 
 def _fine_enough(samples_per_px: float) -> float:
-    # With fewer than two, nothing is known of the frequencies that the sensor's sampling aliases.
+    # With fewer than two, the frequencies that the sensor's sampling aliases are not known.
     if not 2 <= samples_per_px <= 64:
         raise ValueError(
             f"must be from 2 to 64, but it is {samples_per_px:g}. Sample the point-spread function "

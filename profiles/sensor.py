@@ -122,7 +122,7 @@ class Sensor:
                 "beta."
             )
         if self.snr_0 and self.snr_1:
-            # Both bounds grow with snr_1, so that its two ends decide.
+            # Both bounds grow with snr_1, so it suffices to check its two ends.
             lowest = snr_0_bounds(dark, bright, self.snr_1.low)[0]
             highest = snr_0_bounds(dark, bright, self.snr_1.high)[1]
             if self.snr_0.high < lowest or self.snr_0.low > highest:
@@ -244,15 +244,15 @@ class Sensor:
                     f"{', '.join(TABLE_OF)}."
                 )
         fields = dict[str, object]()
-        # Noise is stated in one of two ways: numbers of the one replace those of the other.
+        # Noise is stated in one of two ways. The numbers of one way replace those of the other.
         if numbers.keys() & {"alpha", "beta"}:
             fields |= dict.fromkeys(("snr_0", "snr_1"))
         if numbers.keys() & {"snr_0", "snr_1"}:
             fields |= dict.fromkeys(("alpha", "beta"))
-        # A response settles the contrasts at Nyquist, so that it goes if they are replaced.
+        # A response determines the contrasts at Nyquist, so it is removed if they are replaced.
         if numbers.keys() & {"mtf_nyquist", "mtf_nyquist_along"}:
             fields["response"] = None
-        # Numbers of both ways at once are left to the check of the noise.
+        # If numbers of both ways are given, the check of the noise refuses them.
         return self.with_fields(**{**fields, **numbers})
 
     def with_fields(self, **fields: object) -> "Sensor":
@@ -337,7 +337,7 @@ class Sensor:
             return float(generator.uniform(constant.low, constant.high))
 
         def parameter(constant: Constant) -> float:
-            # A number without a range takes nothing from the generator: the numbers after it stay
+            # A number without a range draws nothing from the generator, so that later draws stay
             # the same.
             return number(constant) if constant.low < constant.high else constant.low
 

@@ -129,7 +129,7 @@ def _content(where: str, table: str, raw: object) -> Mapping[str, Any]:
         )
     ways = TABLES[table]
     check_keys(where, raw, (), table_keys(table))
-    # The two radiances belong to both ways of stating noise, and say of neither that it is meant.
+    # The two radiances belong to both ways of stating noise, so they do not show which is meant.
     telling = set(raw) - {"radiance_0", "radiance_1"}
     begun = [way for way in ways if telling & {*way[0], *way[1]}]
     if len(begun) > 1:

@@ -25,5 +25,5 @@ def numbers_of(profile: Sensor) -> dict[str, object]:
     numbers: dict[str, object] = {
         key: constant and (constant.low, constant.high) for key, constant in constants.items()
     }
-    # The representation holds all samples, where the text of a response holds a digest.
+    # The representation contains all samples. The text of a response only contains a digest.
     return {**numbers, "response": repr(profile.response)}

@@ -183,8 +183,8 @@ def _read(name: str) -> TargetProfile:
     # Nothing reads a table or a key that is in no shipped target. That is checked last, because a
     # wrong type or number is the more precise message.
     keys = _shipped_keys()
-    # The rules of any device hold where a board states their constants, but what only an NPU or a
-    # host reads would have no effect on a DPU.
+    # Any rule applies if a board states its constants. Keys that only an NPU or a host reads would
+    # have no effect on a DPU.
     tables = keys.keys() - NOT_OF_DPUS if profile.configurations else keys
     check_keys(label, profile.tables, (), tables)
     for name, table in profile.tables.items():

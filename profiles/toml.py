@@ -103,7 +103,7 @@ def _number(text: str) -> float:
 
 
 def _whole(text: str) -> int:
-    # It refuses what float64 cannot hold.
+    # It refuses numbers that float64 cannot represent.
     _number(text)
     return int(text)
 

@@ -72,8 +72,9 @@ def _sentence(label: str, error: ValidationError, groups: Mapping[str, str]) -> 
     faults = error.errors(include_url=False)
     missing = {fault["loc"] for fault in faults if fault["type"] == "missing"}
     for fault in faults:
-        # A misspelt key leaves its right name missing: the first is the likelier fault. Pydantic
-        # has one name of this fault for models, another for dataclasses.
+        # A misspelt key also makes the right key missing. The misspelling is the likelier fault, so
+        # it is reported first. Pydantic has one name of this fault for models, another for
+        # dataclasses.
         if fault["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
             *path, key = fault["loc"]
             names = [str(other[-1]) for other in missing if [*other[:-1]] == path]

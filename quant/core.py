@@ -248,7 +248,7 @@ def _in_one_round(
     for op in graph:
         if isinstance(op, Conv):
             key = op.name, frac_bits[op.input], frac_bits[op.output]
-            # A candidate of a search differs from the one before in a few convolutions.
+            # A candidate of a search differs from the one before in few convolutions.
             if key not in earlier or earlier[key][0] is not op:
                 rounded = _quantize_conv(op, frac_bits, shifts)
                 earlier[key] = op, rounded, frac_bits[op.output]
@@ -256,7 +256,7 @@ def _in_one_round(
             ops.append(rounded)
             continue
         if isinstance(op, Add):
-            # The coarsest input stays, for a finer scale would make it clip; finer inputs come
+            # The coarsest input stays, because a finer scale would make it clip. Finer inputs come
             # nearer.
             coarse = min(frac_bits[name] for name in op.inputs)
             for name in op.inputs:
@@ -291,7 +291,7 @@ def _quantize_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts) -> IntCo
     weight = quantize(op.weight, weight_frac_bits)
     bias, bias_frac_bits = quantize_bias(op.bias, product, shifts)
     activation = op.activation
-    # ReLU6 is ReLU where int8 ends no later than the six, as it does once `equalize` has scaled.
+    # ReLU6 equals ReLU if int8 ends at six or below, as it does once `equalize` has scaled.
     ends_first = op.ceiling is not None or INT8_MAX * 2.0 ** -frac_bits[op.output] <= SIX
     if activation is Activation.relu6 and ends_first:
         activation = Activation.relu

@@ -65,7 +65,7 @@ def squared_errors(values: np.ndarray, first: int) -> np.ndarray:
         for k in range(CANDIDATES):
             scale = np.float32(2.0 ** (first + k))
             scaled = part * scale
-            # How ties round does not matter here: either way they err by half a unit.
+            # The rounding of ties does not matter here: either way the error is half a unit.
             difference = np.clip(np.rint(scaled), INT8_MIN, INT8_MAX) - scaled
             errors[k] += float(np.vdot(difference, difference)) / float(scale) ** 2
     return errors

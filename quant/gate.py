@@ -277,7 +277,7 @@ def _results(
             f"{times(results[0].shape)}. The gate compares image-to-image networks only. 'check' "
             "and 'bench' read any network."
         )
-    # The float result alone decides, so that both are treated alike.
+    # Only the float result decides, so that both are treated alike.
     ranges = ranges_of_result(results[0], degraded, ranges)
     results = [to_shares(result, ranges) for result in results]
     is_image = results[0].shape[1] == degraded.shape[1] and share_within(results[0], 0, 1) >= MOST

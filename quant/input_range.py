@@ -182,7 +182,7 @@ def _ends(values: np.ndarray, ranges: Ranges) -> np.ndarray:
     """
     channels = values.shape[-3]
     # A result has the ranges of the image's first channels, because a map of noise levels comes
-    # last. One of more channels than the image has the range of the first.
+    # last. A result with more channels than the image has the range of the first.
     ends = ranges[:channels] if channels <= len(ranges) else ranges[:1]
     return np.array(ends, np.float32).T[:, :, None, None]
 

@@ -52,7 +52,7 @@ class Limits:
 
     mae: float | None = 0.0007
     p999: float | None = None
-    # A network calibrated on few patches clips a few edges: it had 4 and lost 0.14 dB.
+    # A network that was calibrated on few patches clipped 4 edges and lost 0.14 dB.
     std_over_mae: float | None = 5.0
     drop_share: float | None = 0.05
     psnr_drop_db: float | None = None

@@ -319,7 +319,7 @@ def faults_named(label: str) -> Iterator[None]:
     try:
         yield
     except ModelError as error:
-        # As a word of its own: a network may be called "image" or "a".
+        # Only as a whole word, because a network may be called "image" or "a".
         if re.search(rf"(?<![\w.-]){re.escape(one_line(label))}(?![\w-])", str(error)):
             raise
         raise ModelError(f"{label}: {error}") from error

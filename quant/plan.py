@@ -170,7 +170,7 @@ def rounded(plan: Plan, images: Sequence[np.ndarray]) -> tuple[IntCore, Graph]:
         ranges = plan.host_part.input_ranges
         calibration += [brightened(image, ranges) for image in images[::BRIGHT]]
     frac_bits = choose_frac_bits(plan.graph, calibration, plan.host_part, plan.passes.least_squares)
-    # 4. ReLU6 becomes the end of int8, which sums beyond six would be clipped by as well.
+    # 4. ReLU6 is replaced by the end of int8, which would also clip sums beyond six.
     groups = [group for group in plan.groups if not exceeds_six(plan.graph, group, frac_bits)]
     if len(groups) < len(plan.groups):
         plan = replace(plan, groups=groups, singles=singles_of(plan.graph, plan.host_part, groups))
@@ -188,7 +188,7 @@ def rounded(plan: Plan, images: Sequence[np.ndarray]) -> tuple[IntCore, Graph]:
     core = plan.core(graph, frac_bits, finer=finer_members(graph, plan.groups, own))
     if not (plan.groups and plan.passes.equalization):
         return core, graph
-    # Where sums grow by far, one scale for all of them is too coarse for the first. It cost a small
+    # If sums grow much, one scale for all of them is too coarse for the first. It cost a small
     # network that sharpens colours by panchromatic detail 0.56 instead of 0.12 dB (measured).
     apart = replace(plan, groups=[], singles=SingleTensors((), ()))
     own_scales = CropTrials(lambda candidate: apart.core(candidate, frac_bits), targets)
@@ -268,6 +268,7 @@ def _equalized_singles(
     graph = plan.singles.scaled(graph, factors)
     if not plan.host_part.decoding.offsets:
         return graph
-    # Here the image itself is in the tensors, with nothing on the host to make up for a clip.
+    # Here the tensors contain the image itself, and the host adds nothing that could make up for a
+    # clip.
     largest = single_ranges(graph, plan.singles, images, plan.host_part, 1.0, 1.0)
     return plan.singles.scaled(graph, FULL / np.maximum(largest, FULL))

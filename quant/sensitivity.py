@@ -194,7 +194,8 @@ def _in_int8(op: Op, core: IntCore, exact: Mapping[str, np.ndarray]) -> np.ndarr
     """Return a layer's result when it alone is in int8."""
     if isinstance(op, Conv):
         return rounded_to(exact[op.output + IN_INT8], core.frac_bits[op.output])
-    # What only hands values on rounds nothing, because its inputs and result have one scale.
+    # Operations that only pass values on round nothing, because their inputs and result have one
+    # scale.
     if ties_scales(op) and not isinstance(op, AveragePool | Resize):
         return exact[op.output]
     if not isinstance(op, Add):
@@ -323,7 +324,7 @@ def losses(
         return message
     costliest = _costliest(layers or layer_error_rows(result, patches))
     names = ", ".join(f"{name} ({share:.0f} %)" for name, share in costliest)
-    # Of a network that is fine-tuned already there is nothing left to gain by it.
+    # A network that is fine-tuned already gains nothing more by it.
     advice = "" if FINETUNE in metadata(result.host) else "; try `finetune` auto"
     return f"{message}: most of it in {names}{advice}"
 

@@ -54,7 +54,7 @@ def open_session(
     """
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
-    # A plan of the memory takes up to 40 % more of it, and saves no time.
+    # Planning the memory needs up to 40 % more of it, and saves no time.
     options.enable_mem_pattern = False
     # An error is raised, so onnxruntime need not print it as well.
     options.log_severity_level = 4
@@ -65,8 +65,8 @@ def open_session(
         options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
     network = model if isinstance(model, ModelProto) else load_onnx(model)
     name = "the network" if isinstance(model, ModelProto) else str(model)
-    # Outside `contradictions`: the processor is asked with a network of its own, whose faults are
-    # not this file's.
+    # This stands outside `contradictions`, because the processor is tested with another network,
+    # whose faults are not this file's.
     saturates = is_quantized(network) and not int8_adds_exactly()
     with contradictions(name):
         network = with_wide_convolutions(network) if optimise else network

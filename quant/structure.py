@@ -86,7 +86,7 @@ class Rounded:
         """
         channels = values[:, self.counted] if values.ndim > 1 else values
         high = channels == self.lowest + 255
-        # At the lower end nothing is lost where it stands for zero or where a ReLU reads it.
+        # At the lower end nothing is lost if it stands for zero, or if a ReLU reads it.
         low_counts = not self.low_is_relu and self.lowest not in self.scale.zero_points
         low = (channels == self.lowest) & low_counts
         return np.asarray(high | low)

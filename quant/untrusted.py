@@ -54,7 +54,7 @@ def check_content(model: ModelProto, where: str) -> None:
         where: name of the network for the message, such as "a.onnx" or "the float network".
     """
     graph = model.graph
-    # protobuf returns bytes that are no UTF-8 as they are.
+    # protobuf returns bytes unchanged that are not valid UTF-8.
     names = chain.from_iterable((node.op_type, node.domain, node.name) for node in graph.node)
     if not all(isinstance(name, str) for name in names):
         raise ModelError(f"{where} has a name that is no text. Copy or export it again.")
@@ -88,7 +88,8 @@ def contradictions(where: str) -> Iterator[None]:
         raise
     except DAMAGE as error:
         if isinstance(getattr(error, "obj", None), ModuleType):
-            # The installed library lacks what this program calls, whatever the file holds.
+            # The installed library lacks a function that this program calls, whatever the file
+            # contains.
             raise
         reason = reason_of(error)
         raise ModelError(
@@ -147,7 +148,8 @@ def _check_tensor(tensor: TensorProto, where: str) -> None:
             f"{printable(times(tensor.dims))}, but a tensor has at most {RANK} dimensions, each 0 "
             "or more. Export it again."
         )
-    # A tensor that states more than it holds makes a runtime allocate first and read afterwards.
+    # If a tensor states more values than it contains, a runtime allocates first and reads
+    # afterwards.
     stated_count = math.prod(tensor.dims)
     raw = tensor.HasField("raw_data")
     kind = tensor.data_type

@@ -119,7 +119,7 @@ def detector_to_onnx(
     buffer = io.BytesIO()
     image = torch.zeros(1, 3, side_px, side_px)
     with warnings.catch_warnings():
-        # The newer exporter wants onnxscript, a package more.
+        # The newer exporter requires onnxscript, another package.
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.onnx.export(
             Decoding(network).eval(),

@@ -42,7 +42,7 @@ class Stream:
         self.stream = stream or open(os.devnull, "w")  # noqa: PTH123, SIM115 - as long as the process
         self.lost = ""
         if isinstance(self.stream, io.TextIOWrapper):
-            # A name that a terminal cannot show must end no run either.
+            # A name that the terminal cannot show must not end a run either.
             self.stream.reconfigure(errors="backslashreplace")
 
     def write(self, text: str) -> int:

@@ -39,7 +39,7 @@ def boards_of(board: BoardLike | Sequence[BoardLike]) -> list[TargetProfile]:
     elif isinstance(board, Sequence):
         sources = board
     else:
-        # What is no board is refused when it is loaded.
+        # Anything that is not a board is refused when it is loaded.
         sources = [board]
     if not sources:
         raise OptionError("`target` names no board. Give a name, a .toml file, or all.")
@@ -226,5 +226,5 @@ def device_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
             f"`dpu` cannot be {printable(repr(configuration))} for {profile.name}, because this "
             "board has an NPU. Leave it out."
         )
-    # An NPU has rules, and no configuration that a prediction could rest on.
+    # An NPU has rules, but no configuration to predict with.
     return Dpu(profile, "NPU", {})

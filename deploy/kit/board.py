@@ -112,7 +112,7 @@ class Board(TargetProfile):
         exposed = {} if profile is None else network.exposures
         facts = host_facts(network, tile, profile, exposed)
         core = network.core(self, tile)
-        # What an earlier kit in this folder states of its cores would be wrong of these.
+        # Files of an earlier kit in this folder would describe other cores.
         records = [folder / "record" / name for name in RECORD]
         others = [folder / name for name in ("known.json", "host.json", "host.py")]
         for older in (*folder.glob("core-x*.onnx"), *others, *records):

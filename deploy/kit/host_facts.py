@@ -124,7 +124,7 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
         ("back", part.back, part.outputs),
         ("last", part.last, part.outputs),
     ):
-        # Of one band ONNX's order of the channels is that of torch, which host.py has.
+        # For one band, ONNX's order of channels equals torch's, which host.py uses.
         same_order = all(move.columns_first or channels == move.block**2 for move in moves)
         if not same_order or len(moves) > 1:
             return None
@@ -155,7 +155,7 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
 
 def _require_room(tile_px: int, tiling: Tiling) -> None:
     """Raise OptionError if `host.py` could not cut an image into tiles of this side."""
-    # Between two halos a tile must retain pixels, and it must begin where the strides repeat.
+    # A tile must keep pixels between its two halos, and begin at a multiple of the strides.
     smallest_px = tiling.whole_px(2 * tiling.halo_px + tiling.alignment_px)
     if tile_px < smallest_px or tile_px % tiling.alignment_px:
         multiple = f"a multiple of {tiling.alignment_px} px and " if tiling.alignment_px > 1 else ""

@@ -77,7 +77,7 @@ def write_record(
         MissingExtraError: cyclonedx-python-lib is not installed.
     """
     record = record_of(judged, network, sensor, floating)
-    # All three are made before the first is written: a record is whole or not there.
+    # All three are made before the first is written, so that a record is complete or absent.
     texts = json.dumps(record, indent=1) + "\n", render(_page(judged, record)), bill_of(record)
     for path, text in zip(recorded(folder), texts, strict=True):
         write_text(path, text)

@@ -112,7 +112,7 @@ def header_scale(name: str, raster: Raster, reading: Reading) -> FullScale | str
     try:
         return full_scale_of(name, raster, (), reading)
     except ImageError:
-        # Of integers only those of 8 bits leave it open.
+        # Only 8-bit integers leave full scale open.
         return "8-bit pixels do not tell it; state the pixel value that is full scale"
 
 

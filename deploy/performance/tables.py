@@ -233,7 +233,7 @@ def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) ->
         ]
         if fits:
             peak, row = min(fits, key=lambda fit: fit[0])
-            # A DPU that meets the time surely is not named again for less.
+            # A DPU that is named for a surer level is not named again.
             names.setdefault(f"{row.name} ({peak / 1e12:.3g} TOPS)", how)
     words = "; ".join(f"{how} {name}" for name, how in names.items()) or "none of these"
     return f"the smallest DPU that takes {within_s:g} s or less: {words}"

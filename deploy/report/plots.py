@@ -101,7 +101,7 @@ def look() -> Iterator[None]:
 
     # The user's own style must not change our plots.
     with warnings.catch_warnings(), style.context(["default", LOOK]):
-        # A letter that the font lacks is a box in a PNG; of an SVG the browser has its own.
+        # A letter that the font lacks is a box in a PNG. For an SVG the browser uses its own font.
         warnings.filterwarnings("ignore", "(?s)Glyph .* missing", UserWarning)
         yield
 

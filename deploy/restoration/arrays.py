@@ -68,7 +68,7 @@ def restore_array(
             # Masked pixels stay masked, so the mask is enlarged with the image.
             scale = results[0].shape[-1] // mask.shape[-1]
             mask = mask.repeat(scale, axis=-2).repeat(scale, axis=-1)
-            # A network that makes other bands makes each of them of all bands of the image.
+            # A network that returns other bands computes each of them from all bands of the image.
             if mask.shape != results[0].shape:
                 planes = mask if mask.ndim == 2 else mask.any(axis=0)
                 mask = np.broadcast_to(planes, results[0].shape)

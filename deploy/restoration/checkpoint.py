@@ -262,7 +262,7 @@ class Checkpoint:
     def _require_room(self, more_bytes: int) -> None:
         bands, height, width = self.shape
         rows_bytes = bands * (height - self.rows) * width * self.dtype.itemsize
-        # How well the pixels pack is not known yet, so nothing is assumed to be packed.
+        # The compression of the pixels is not known yet, so none is assumed.
         needed = rows_bytes + padded_px(self.shape) * self.dtype.itemsize + more_bytes
         free = shutil.disk_usage(self.out.parent).free
         if needed > free:

@@ -59,7 +59,7 @@ def check_memory(rows: int, budget_bytes: int | None) -> int:
     resident_bytes = psutil.Process().memory_info().rss
     allowed_bytes = budget_bytes
     if allowed_bytes is None:
-        # What this process holds already is not part of what is free.
+        # Memory that this process already uses is not free.
         allowed_bytes = psutil.virtual_memory().available + resident_bytes
     if resident_bytes + rows <= allowed_bytes:
         return resident_bytes + rows

@@ -48,7 +48,7 @@ class Engine:
     scheduler: str | None = None
 
     def __post_init__(self) -> None:
-        # How many threads a worker of a scheduler may have is not known here.
+        # It is not known here how many threads a worker of a scheduler may use.
         if self.scheduler is None:
             require_cores("threads", self.threads)
 
@@ -78,7 +78,7 @@ def open_openvino(model: onnx.ModelProto, threads: int, at_once: int = 1) -> tup
         ModelError: at the first run, if OpenVINO cannot run the network.
     """
     openvino = optional("openvino", "runtime")
-    # This fills a table: two threads that are its first callers lock each other up (2026.4).
+    # This fills a table. Two threads that call it first at the same time deadlock (2026.4).
     openvino.Type.f32.to_dtype()
     core = openvino.Core()
     # Without the hint OpenVINO rounds to bfloat16 where the processor has units for it.

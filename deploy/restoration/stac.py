@@ -189,7 +189,7 @@ def write_network_item(network: Network, path: Path, when: datetime) -> None:
     pystac: Any = import_module("pystac")
     files: Any = import_module("pystac.extensions.file")
     mlm: Any = import_module("pystac.extensions.mlm")
-    # Of a network without the digest of a file, the digest is that of what is written here.
+    # If the digest of the network's file is not known, the file is written here and digested.
     file = network.path if network.file_sha256 else None
     file = file or network.save(path.with_suffix(".onnx"))
     item = pystac.Item(
@@ -220,7 +220,7 @@ def write_network_item(network: Network, path: Path, when: datetime) -> None:
             precision=network.precision, sensor=network.sensor or "not stated"
         ),
     )
-    # As null, which pystac writes, it would say that the network was trained from scratch.
+    # pystac writes null, which would mean that the network was trained from scratch.
     del item.properties["mlm:pretrained_source"]
     asset = pystac.Asset(
         _href(file, path),

@@ -137,7 +137,7 @@ def bench(
     # The digests are those of the files that are read from here on.
     inputs = inputs_of(*paths)
     boards = boards_of(target)
-    # Next to other boards an NPU is refused below, because nothing can be predicted of it.
+    # Next to other boards an NPU is refused below, because nothing can be predicted for it.
     if len(boards) == 1 and boards[0].npu:
         refuse_with(
             f"`target` {boards[0].name}, for which nothing is predicted", **options(*OF_BOARDS)

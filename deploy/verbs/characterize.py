@@ -87,7 +87,7 @@ def contrasts(mtf: Any) -> tuple[float, float]:
     """Return the contrast at Nyquist across and along the track; one number stands for both."""
     from beers_deploy.profiles.instrument import MTF_NYQUIST_MAX
 
-    # One number of Python stands for itself.
+    # One number is used for both axes.
     parts = list(mtf) if isinstance(mtf, list | tuple) else str(mtf).split(",")
     try:
         across, along = (float(part) for part in (parts * 2)[:2])

@@ -55,7 +55,7 @@ def demo(
         MissingExtraError: torch, scikit-image or matplotlib is not installed.
     """
     refuse_without("`image`", full_scale=full_scale is not None and image is None)
-    # What the last steps need is asked for before the first writes.
+    # Packages of the last steps are checked before the first step writes.
     for package in ("skimage", "matplotlib"):
         optional(package, "demo")
     # These load torch.
@@ -86,7 +86,7 @@ def demo(
         placement = check(int8, tile=640).placement
         bar.advance(1, "restoring with the traditional pipeline and with INT8")
         traditional = restore(degraded, method="traditional", sensor=sensors[0], full_scale=MAX_DN)
-        # The file holds integers: what is measured and shown is what it holds.
+        # The file stores integers, so these are measured and shown.
         floats = restore(degraded, network=int8, sensor=sensors[0], full_scale=MAX_DN)
         restored = np.rint(floats)
         write_tiff(folder / "restored.tif", restored.astype(np.uint16))

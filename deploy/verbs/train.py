@@ -128,7 +128,7 @@ def train(
             "`rounding` has no effect without `conditioned` and `start`. Add both, or leave "
             "`rounding` out."
         )
-    # 0 asks for no validation, which a run without images has none of.
+    # 0 requests no validation, which is allowed without images.
     if not folders and validate_every:
         refuse_without("`images`", **options("validate_every"))
     if not lpips_weight:

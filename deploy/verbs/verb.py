@@ -192,7 +192,7 @@ def delete_older(function: Callable[..., Any], arguments: Mapping[str, Any]) -> 
 
     paths = paths_of(function, arguments)
     for path in paths.verdicts:
-        # What may not be written is refused afterwards, when all verdicts are deleted.
+        # Files that may not be written are refused afterwards, when all verdicts are deleted.
         with suppress(BeersError):
             require_writable(path, inputs=paths.inputs)
             path.unlink(missing_ok=True)
@@ -318,7 +318,7 @@ def recorded(arguments: Mapping[str, object]) -> dict[str, object]:
 def _recorded(value: object) -> object:
     if isinstance(value, str | int | float | bool | type(None)):
         return value
-    # A number of NumPy is none of JSON.
+    # JSON cannot represent NumPy's numbers.
     if isinstance(value, Real):
         return float(value)
     if isinstance(value, os.PathLike):

@@ -84,7 +84,7 @@ class Smoothing:
                 so that the outer SMOOTH_PX pixels are right at the border of the image only.
         """
         least = np.fmin.reduce(restored, axis=None)
-        # No mean is below the least pixel but for rounding, so that no window would change.
+        # But for rounding, no mean is below the smallest pixel, so that no window would change.
         if not self._noise(least * np.float32(0.99)) > 0:
             return restored
         x = np.pad(restored, SMOOTH_PX, "symmetric")

@@ -224,7 +224,7 @@ class Consistency:
         blurred += self._far(finite, missing if any_missing else None, down, across)
         raw_means = block_means(raw_pixels)
         excess = np.interp(raw_means, self.means, self.excess, right=0.0).astype(np.float32)
-        # A mean below the least that is possible counts as no light.
+        # A mean below the smallest possible value counts as no light.
         excess = np.minimum(excess, np.maximum(raw_means, np.float32(0)))
         residual = raw_means - excess - blurred
         weights = free_blocks(raw >= self.full_scale, (down, across), raw_at, NEAR_PX)
@@ -239,7 +239,7 @@ class Consistency:
             change /= np.maximum(share, np.float32(LEAST_SHARE))
         if self.detail is not None:
             fine = self.detail.correction(raw_pixels, near_pixels, down, across)
-            # Next to a block that does not count the finer residual is no noise, and may be NaN.
+            # Next to an excluded block, the finer residual is no noise, and may be NaN.
             change += fine if share is None else np.where(share == 1, fine, np.float32(0))
         if smooth is not restored:
             rows, columns = (

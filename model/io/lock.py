@@ -57,8 +57,8 @@ def only_run(out: Path) -> Iterator[None]:
 
 def _take(out: Path, folder: Path) -> BaseFileLock:
     """Acquire the lock and return it; if the file system has no locks, it is not acquired."""
-    # A file that only stands for a lock would outlive a killed run: rather none where the system
-    # has none.
+    # A file without a lock on it would outlive a killed run, so there is none if the system has no
+    # locks.
     if folder.is_symlink():
         raise MachineError(
             f"{folder} must be a folder of this program, but it is a symbolic link. Remove it, or "

@@ -114,7 +114,8 @@ def read_weights(path: Path) -> Weights:
         variant = Variant(int(shape["blocks"]), int(shape["features"]), int(shape.get("scale", 1)))
         if variant.scale < 1:
             raise ValueError(f"it states a scale of {variant.scale}")
-        # Before a list of the network's is made: a header alone must not take memory.
+        # This is checked before a list of the network's size is made, because a header alone must
+        # not take memory.
         if len(tensors) != 4 * variant.blocks + (7 if conditioned else 6):
             raise ValueError(f"it has {len(tensors)} tensors for {variant}")
         shapes = variant.banked_shapes if conditioned else variant.shapes

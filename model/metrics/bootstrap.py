@@ -41,7 +41,7 @@ def site_interval(
     groups = [numbers[names == name] for name in np.unique(names)]
     sums, counts = (np.array([f(group) for group in groups]) for f in (np.sum, np.size))
     draws = generator.integers(len(groups), size=(DRAWS, len(groups)))
-    # Sums over counts and not a mean of means: a site of many images counts for them.
+    # The sums are divided by the counts, so that a site of many images counts for them.
     means = sums[draws].sum(1) / counts[draws].sum(1)
     return percentiles(means), WORDS
 

@@ -105,8 +105,8 @@ def _wrong(patches: np.ndarray, step: float) -> np.ndarray:
     ring[2:5, 2:5] = False
     scatter = np.sqrt(np.nanmean(np.square(both[:, ring]), axis=1))
     ground = np.nanmedian(patches[:, 2:7, 2:7].reshape(len(patches), 25), axis=1)
-    # Rounding hides the noise of a quiet image, and an end of the range cuts it off: neither may
-    # pass for no noise.
+    # Rounding hides the noise of a quiet image, and an end of the range cuts it off. Neither may be
+    # taken for no noise.
     is_cut_off = (patches == ground[:, None, None]).mean((1, 2)) > CUT
     floor = np.where(
         is_cut_off,
@@ -116,7 +116,7 @@ def _wrong(patches: np.ndarray, step: float) -> np.ndarray:
     scatter = np.maximum(scatter, floor)
     middle = patches[:, 3:6, 3:6].reshape(len(patches), 9)
     around = np.delete(middle, 4, axis=1)
-    # A star that full scale cuts off is lower than its sides promise, and still above them: that is
+    # A star that full scale cuts off is lower than its sides suggest, and still above them. That is
     # no fault.
     outward = np.where(middle[:, 4] > np.nanmax(around, axis=1), centre, -centre)
     with np.errstate(invalid="ignore", divide="ignore"):

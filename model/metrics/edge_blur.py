@@ -117,8 +117,8 @@ def plain_squares(
     rows, columns = (places[numbers][:, None, None] for places in (rows, columns))
     squares = image[rows + reach[:, None], columns + reach]
     valid = ((squares > 0) & (squares < clipped_at)).all((1, 2))
-    # The three outer columns on either side scatter by noise alone. The tails of the blur slope:
-    # what a column does along itself is what counts.
+    # The three outer columns on either side scatter by noise alone. The tails of the blur have a
+    # slope, so only the scatter within a column counts.
     left = squares[:, :, :3]
     right = squares[:, :, -3:]
     step = np.abs(right.mean((1, 2)) - left.mean((1, 2)))
@@ -228,7 +228,7 @@ def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
         others: the blurs of the edges across the other axis, from which the fit of the profiles'
             curve corrects inclined edges; may be empty.
     """
-    # Imported here: who measures no sensor need not wait for SciPy.
+    # Imported here, because only measurements of sensors need SciPy.
     from scipy.special import stdtrit
 
     other_gamma = float(np.median([edge.gamma for edge in others])) if others else None
@@ -236,9 +236,9 @@ def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
         np.array(part)
         for part in zip(*(_of_shape(own, other_gamma, s) for s in SHAPES), strict=True)
     )
-    # The best shape leaves the noise at least: less is chance.
+    # Even the best shape leaves the noise. A smaller rest is chance.
     scatter = np.maximum(chi2.min(0) / [edge.count for edge in own], 1.0)
-    # The median and not the sum: an edge that another crosses nearby has a shape of its own.
+    # The median is used, because an edge that another crosses nearby has another shape.
     weights = -len(own) / 2 * np.median((chi2 - chi2[0]) / scatter, axis=1)
     # The prior gives half of its weight to the profile's curve, because few edges cannot determine
     # another one.

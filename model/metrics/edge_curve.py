@@ -181,7 +181,7 @@ def search_curve(edges: Sequence[Edge], generator: np.random.Generator) -> MtfCu
     for unevenness, least, floor in TIERS:
         tier = [edge for edge in fitted if edge.unevenness <= unevenness][:MOST_EDGES]
         curve = _curve_of_sharpest(tier, least, floor, generator)
-        # A refusal of a later tier replaces no curve of an earlier one.
+        # A later tier that is refused does not replace the curve of an earlier one.
         if isinstance(result, Refusal) or isinstance(curve, MtfCurve):
             result = curve
         if isinstance(result, MtfCurve) and not result.missing_edges:
@@ -306,8 +306,8 @@ def _drawn(
             sample = [equations[number] for number in generator.integers(count, size=count)]
         gram = np.sum([pair[0] for pair in sample], axis=0)
         moment = np.sum([pair[1] for pair in sample], axis=0)
-        # Where pixels say little, the expected smoothness decides. It is drawn too, and is the
-        # loosest one, so that the interval holds what a smooth curve hides.
+        # Where pixels determine little, the expected smoothness decides. It is drawn too, and is
+        # the loosest possible, so that the interval includes what a smooth curve hides.
         draws.append(solve(gram, moment, weights, BENDS[-1], generator.standard_normal(PARTS - 3)))
     return draws
 
@@ -332,7 +332,8 @@ def _with_interval(
         looks = sum(
             edge.strip.size if edge.unevenness <= EVEN else strips_of(edge) for edge in edges
         )
-    # Few looks ask for Student's quantile, and a bootstrap's variance is too small by (n - 1) / n.
+    # With few looks, Student's quantile is needed, and the variance of a bootstrap is too small by
+    # (n - 1) / n.
     wider = (
         float(stdtrit(looks - 1, HIGH_PERCENT / 100))
         / NORMAL_QUANTILE

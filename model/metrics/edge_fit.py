@@ -216,7 +216,7 @@ def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fi
             np.abs(lines.slope) > MAX_SLOPE
         )
         converged = ~astray & (gamma_change < CONVERGED)
-        # Each edge has its own count of passes: what has converged leaves the batch.
+        # Each edge has its own number of passes: converged edges leave the batch.
         for k in np.flatnonzero(converged):
             own_gamma = float(lines.gamma[k])
             chi2 = float(chi2s[k])
@@ -224,7 +224,7 @@ def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fi
             count_px = int(mask[k].sum()) - 5
             scatter = chi2 / count_px
             misfit = math.sqrt(max(scatter - 1, 0.0)) / max(step, 1e-9)
-            # By chance less than the noise may be left, which makes no error smaller.
+            # The rest may be smaller than the noise by chance, which makes no error smaller.
             error = math.sqrt(float(variance[k]) * max(scatter, 1.0))
             if misfit > limits.misfit or step < limits.step_sigma or error > limits.error:
                 continue

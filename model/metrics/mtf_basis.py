@@ -171,7 +171,7 @@ def solve(
     Returns:
         The weights (PARTS,).
     """
-    # Imported here: who measures no sensor need not wait for SciPy.
+    # Imported here, because only measurements of sensors need SciPy.
     from scipy.optimize import nnls
 
     expected = expected_bends(near, bend)

@@ -123,7 +123,7 @@ def _side_by_side(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _measured(mean: np.ndarray, pixels: np.ndarray, part: np.ndarray) -> Blocks:
     """Return blocks (N, S, S) with these means and parts by the energies of their bands."""
-    # Imported here, and SciPy below: who measures no sensor need not wait for it.
+    # Imported here, like SciPy below, because only measurements of sensors need it.
     from scipy.fft import dctn
 
     # A plane is subtracted from each block.

@@ -170,9 +170,9 @@ def fit_noise(blocks: Blocks, incomplete: bool = False) -> NoiseModel | Refusal:
         fits.append(_fitted(quiet, counts[numbers]))
     draws = np.array(fits)
     if one_level:
-        # How the noise grows with light is unknown. The fit attributes all of it to photons: given
-        # too much noise in bright light, a restoration smooths; given too little, it produces
-        # grain. The draws range from none to all.
+        # It is not known how the noise grows with light. The fit attributes all of it to photons,
+        # because a restoration that assumes too much noise in bright light smooths, and one that
+        # assumes too little produces grain. The draws range from none to all.
         level = float(np.median(quiet.mean))
         shares = np.append(1.0, generator.uniform(size=len(draws)))
         numbers = np.vstack([fit, draws])
@@ -248,7 +248,7 @@ def _fitted(blocks: Blocks, weights: np.ndarray, band: np.ndarray | None = None)
     fit = np.zeros(3)
     for _ in range(4):
         noise = blocks.noise(fit) if fit.any() else size
-        # White noise is alike in all bands: what the structure has beyond it is texture.
+        # White noise is equal in all bands, so an excess of the structure is texture.
         terms = np.stack(
             [blocks.mean, np.ones(band.size), np.maximum(blocks.structure - noise, 0)], axis=1
         )

@@ -240,7 +240,8 @@ def normal_equations(
         normal = normal * root_counts[:, None]
         curve = curve * root_counts[:, None]
         residuals = residuals * root_counts
-    # Without what planes and line could explain: the rest speaks of the curve alone.
+    # The part that planes and line could explain is removed, so that the rest depends on the curve
+    # alone.
     basis, _ = np.linalg.qr(normal)
     curve = curve - basis @ (basis.T @ curve)
     residuals = residuals - basis @ (basis.T @ residuals)

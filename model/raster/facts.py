@@ -274,7 +274,7 @@ def usable_nodata(value: float | None, dtype: np.dtype[Any]) -> float | None:
     """Return the nodata value of an image, or None if the type of its pixels cannot hold it."""
     if value is None:
         return None
-    # A value that no pixel can have marks none, so the image is as good without it.
+    # A nodata value that no pixel can have marks none, so it is ignored.
     if dtype.kind == "f":
         fits = not math.isfinite(value) or abs(value) <= float(np.finfo(dtype).max)
     else:

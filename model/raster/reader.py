@@ -64,7 +64,7 @@ ENVIRONMENT = {
     "GDAL_VRT_RAWRASTERBAND_ALLOWED_SOURCE": "NONE",
     # Otherwise the end of a truncated JPEG is grey, without any error.
     "GDAL_ERROR_ON_LIBJPEG_WARNING": "TRUE",
-    # This way of reading a whole PNG leaves memory as it was where the file ends early.
+    # GDAL's other way of reading a whole PNG leaves memory uninitialised if the file ends early.
     "GDAL_PNG_WHOLE_IMAGE_OPTIM": "NO",
     # Threads that decode print their errors, which are raised as one exception as well.
     "CPL_LOG": os.devnull,

@@ -164,7 +164,7 @@ def disk_errors(output: Path | str | None = None) -> Iterator[None]:
         # GDAL does not state that the disk is full, but Python does if the file cannot grow either.
         path = None if output is None or isinstance(error, CODE_FAULTS) else Path(output)
         if path is not None and path.is_file():
-            # A tile's size appended raises the OSError of a full disk.
+            # Appending as many bytes as a tile has raises the OSError of a full disk.
             with path.open("ab") as file:
                 file.write(bytes(ROOM_BYTES))
         # RasterioIOError is an OSError, and names its cause instead of itself.

@@ -164,7 +164,7 @@ class Decision:
     effect: str
     choice: Choice
     why: str
-    # None where it is applied without asking, or not there to be bounded.
+    # None if the effect is applied without asking, or absent.
     bound_dn: float | None
     cost: str
 
@@ -240,11 +240,11 @@ def effect_bounds(sensor: Instrument, stats: SceneStats) -> dict[str, float]:
         high += direct_dn / gain
 
     if "smear" in sensor.effects:
-        # The smear's kernel less a pulse sums to 0: it sees at most half its size times the span,
-        # or steps times moment; the blur behind it enlarges that by its ringing.
+        # The kernel of the smear minus a pulse sums to 0. Its effect is at most half its size times
+        # the span, or steps times moment. The blur behind it multiplies that by its ringing.
         size, moment = smear_moments(stats.height, stats.oversampling, sensor.smear_px)
         add("smear", gain * ringing * min(size * span, moment * stats.step_along))
-        # Its kernel is a unit pulse and all that differs from it.
+        # Its kernel is a unit pulse plus the difference from it.
         total *= 1 + 2 * size
     # The blurred pixel and the plain mean of its scene pixels lie in one range: they differ by its
     # width at most.

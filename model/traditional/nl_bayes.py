@@ -167,7 +167,8 @@ def denoise_pass(
         noisy_rows = noisy.window(rows)
         guide_rows = guide.window(rows)
         sums = _row_of_tiles(noisy_rows, guide_rows, run - run[0], noise, settings, stride_px)
-        # Tiles of two rows overlap: what the row above left below its own share counts here.
+        # Tiles of two rows overlap: the part that the row above left below its own share counts
+        # here.
         if carried is not None:
             for sum_, before in zip(sums, carried, strict=True):
                 sum_[: len(before)] += before
@@ -336,7 +337,8 @@ def nl_bayes_strips(
     Raises:
         ImageError: a pixel is infinite.
     """
-    # The second pass reads the noisy rows again, behind the first: tee keeps those between.
+    # The second pass reads the noisy rows again, later than the first. `tee` keeps the rows
+    # between.
     as_guide, for_first, for_second = tee(finite_or_missing(strips), 3)
     basic = denoise_pass(
         Rows(for_first), Rows(as_guide), height, noise, first_pass(noise.sigma), quality.stride_px

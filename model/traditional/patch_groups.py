@@ -162,13 +162,13 @@ def estimate_groups(
         diagonal.add_(JITTER * noise.sigma**2)
     factor, failed = torch.linalg.cholesky_ex(covariance)
     no_factor = failed != 0
-    # Any factor does there, since its result is thrown away: the batch has to stay one call.
+    # Any factor is valid there, because its result is not used. The batch has to stay one call.
     factor[no_factor] = torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device)
     solved = torch.cholesky_inverse(factor) @ sigma_matrix
     solved[no_factor] = 0
     shrinkage[~flat] = solved
     estimates = torch.baddbmm(noisy, centred, shrinkage, alpha=-1)
-    # The plain mean knows that the signal is one number; the Gaussian model would have to find that
+    # The plain mean uses that the signal is one number. The Gaussian model would have to find that
     # out.
     estimates[flat] = mean[flat].mean(2, keepdim=True)
     return estimates

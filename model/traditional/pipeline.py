@@ -132,7 +132,7 @@ def restore_strips(
         OptionError: the pipeline has no epsilon, which `TraditionalPipeline.fitted_to` derives.
     """
     radiance = (to_radiance(strip, pipeline.degraded) for strip in finite_or_missing(strips))
-    # The converter's rounding adds a twelfth of a squared DN, which NL-Bayes must know of.
+    # The converter's rounding adds a twelfth of a squared DN, which NL-Bayes must include.
     sensor = with_rounding_noise(pipeline.degraded)
     kernel = pipeline.kernel()
     quality = QUALITIES[pipeline.quality]

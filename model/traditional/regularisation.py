@@ -104,7 +104,7 @@ class NoiseAndScene:
         fy = np.fft.fftfreq(GRID)[:, None]
         fx = np.fft.fftfreq(GRID)[None, :]
         r_squared = (fx**2 + fy**2) / NYQUIST**2
-        # The mean of an image is no contrast: the quotient is 0 there.
+        # The mean of an image is no contrast, so the quotient is 0 there.
         r_squared[0, 0] = np.inf
         differences = 2 * np.sin(np.pi * fx) ** 2 + 2 * np.sin(np.pi * fy) ** 2
         power = np.abs(sensor_mtf(fx, fy, sensor)) ** 2
@@ -198,7 +198,8 @@ def _sums(
         squares += total / np.maximum(pairs, 1)
         axes += pairs > 0
     _, below_full_scale = _blocks(np.where(unsaturated, radiance, np.nan))
-    # Saturated pixels say nothing of the scene. One among others counts, or epsilon would jump.
+    # Saturated pixels contain no information about the scene. A single one among others is kept, or
+    # epsilon would jump.
     usable = (axes > 0) & (below_full_scale > 0)
     pixels = pixels[usable]
     mean_radiance = np.maximum(light[usable] / pixels, 0)

@@ -181,7 +181,7 @@ def read_checkpoint(
     asked = _options(asdict(recipe))
     changed = []
     for name, value in asked.items():
-        # The rounding is a digest, which says nothing to a reader.
+        # The rounding is a digest, which tells a reader nothing.
         values = f" was {begun.get(name)!r}, and is {value!r}" if name != "rounding" else " differs"
         if begun.get(name) != value:
             changed.append(f"`{name}`{values}")

@@ -113,6 +113,7 @@ def fft_l1(restored: Tensor, reference: Tensor) -> Tensor:
     pixels, and twice that at 256. The absolute value is computed by abs(), whose gradient at 0 is
     0; that of sqrt(re^2 + im^2) is NaN.
     """
-    # Orthonormal, so that the term does not grow with the patch. abs() has a gradient at 0.
+    # The transform is orthonormal, so that the term does not grow with the patch. abs() has a
+    # gradient at 0.
     size: Tensor = torch.fft.rfft2(restored - reference, norm="ortho").abs().mean()
     return size

@@ -138,7 +138,7 @@ class PatchSource:
                 "None of the training images is large enough for a patch of "
                 f"{self.recipe.patch_px} target pixels. Give larger images or a smaller patch."
             )
-        # Mixed, because neighbours of one scene would make a batch whose gradient knows one scene.
+        # Patches are mixed, because a batch of neighbours would have a gradient for one scene.
         places = torch.from_numpy(generator.permutation(count)[:shard_size])
         patches = torch.cat(parts)
         patches = patches[places.to(patches.device)]

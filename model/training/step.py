@@ -136,7 +136,7 @@ class Step:
         norm = clip_grad_norm_(self.network.parameters(), self.gradient_norm)
         skipped = (~(torch.isfinite(total) & torch.isfinite(norm))).float()
         if self.agree is not None:
-            # All workers skip a step that is bad for one of them, or their weights would part.
+            # All workers skip a step that is bad for one of them, or their weights would diverge.
             skipped = self.agree(skipped)
         for group in self.optimiser.param_groups:
             group["lr"].copy_(inputs.rate)
@@ -171,7 +171,8 @@ class Step:
         with torch.cuda.stream(stream):
             for _ in range(WARM_UPS):
                 self._backward(inputs)
-            # Adam makes its moments in its first step: outside the recording, and without a change.
+            # Adam creates its moments in its first step, so this one is outside the recording and
+            # changes nothing.
             self.optimiser.found_inf = torch.ones((), device=self.device)  # type: ignore[attr-defined]
             self.optimiser.step()
             self.optimiser.zero_grad(set_to_none=True)

@@ -64,7 +64,7 @@ def split_by_site(
             )
         held_out += sites[site]
     if len(sites) >= 3 and not excluded:
-        # The name decides between sites of one size, so that the split is always the same.
+        # The name breaks ties between sites of one size, so that the split is always the same.
         for site in sorted(sites, key=lambda s: (len(sites[s]), s)):
             if len(held_out) >= SHARE * len(names):
                 break
@@ -89,7 +89,7 @@ class Validation:
             ratio = fitting_oversampling(scene.radiance, OVERSAMPLINGS, LEAST_SIDE_PX)
             if ratio is None:
                 continue
-            # Seed 0 whatever that of the run: validation is the same in every run.
+            # The seed is always 0, so that validation is the same in every run.
             draw = Draw(0, number)
             sensors = [profile.draw(draw.generator("sensor")) for profile in (degraded, reference)]
             pair = simulate_pair(scene.radiance, sensors[0], sensors[1], ratio, draw)
@@ -154,7 +154,7 @@ def write_picture(validation: Validation, network: Network, path: Path) -> None:
         top, left = busiest_windows(images[2], side)[0]
         crops = (image[top : top + side, left : left + side] for image in images)
         rows.append(strip_row(crops, stretch_of(images[2])))
-    # Scenes may have other sizes, and the cells of a grid have one.
+    # Scenes may differ in size, but the cells of a grid have one size.
     smallest = min(row[0].shape for row in rows)
     cells = [[cell[: smallest[0], : smallest[1]] for cell in row] for row in rows]
     with whole_file(path) as temporary:

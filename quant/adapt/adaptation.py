@@ -123,7 +123,7 @@ def adapt(model: onnx.ModelProto, samples: Patches, held_out: Patches) -> Adapte
     if not counts:
         return Adapted(model)
     exact = {kind for kind in counts if kind not in APPROXIMATIONS}
-    # Raises an error for operators that the DPU still lacks before the work of fitting.
+    # Raises an error if the DPU still lacks an operator, before the work of fitting.
     read_network(replaced(model, counts.keys() - exact, exact, {}))
     images = _fit_images(model, samples.degraded)
     ends = by_kind.get(Kind.normalization, ())

@@ -8,7 +8,6 @@ By another function:
 2. Any other Sigmoid becomes HardSigmoid. A Tanh becomes a line of slope `TANH_SLOPE` that is
    clipped at -1 and 1, computed as ReLU6 of a scaled and shifted input.
 3. LeakyReLU of another slope, and PReLU, become LeakyReLU of 26/256.
-
 4. Spatial attention that shrinks and enlarges by no whole factors is aligned with its map
    (`quant.graph.attention`).
 5. Maps that are padded by reflection or by their edge are padded by zeros. The host mirrors the

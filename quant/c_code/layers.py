@@ -238,8 +238,8 @@ def _conv(w: LayerWriter, op: IntConv, number: str) -> None:
     weight = op.weight
     spread = 1
     if op.transposed:
-        # A transposed convolution is one over an input with zeros in between, its weights turned
-        # round; its padding crops, so it takes off the full padding.
+        # A transposed convolution is a convolution of an input with zeros in between, by rotated
+        # weights. Its padding crops, so it is subtracted from the full padding.
         spread = window.strides[0]
         weight = weight[:, :, ::-1, ::-1]
         rows, columns = (side - 1 for side in weight.shape[2:])

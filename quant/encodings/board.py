@@ -202,7 +202,7 @@ def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> Mo
         writer.operation(op, [writer.read(name) for name in op.inputs], writer.source(op.output))
     writer.read(CORRECTION, CORRECTION)
     model = _core_file(writer, core.host_part, about, side_px)
-    # The compiler of an NPU takes stated sizes alone, of inner tensors too.
+    # The compiler of an NPU requires that sizes are stated, also those of inner tensors.
     return shape_inference.infer_shapes(model, strict_mode=True)
 
 

@@ -78,7 +78,7 @@ def aligned(graph: OnnxGraph, node: Node) -> dict[Node, list[Node]]:
     replacements = {}
     source = nodes[0].source
     for place, old in enumerate(nodes):
-        # Another name, because it is not the tensor of the original any more.
+        # It has another name, because it is no longer the tensor of the original.
         result = f"{old.result}.aligned"
         attributes = {**old.attributes, **changes.get(place, {})}
         inputs = [source, *old.inputs[1:]]

@@ -58,7 +58,8 @@ class Base:
         # Pixel p of those that a pixel becomes reads its neighbour at offset o by the weight
         # p - o factor, counted from the middle.
         taps = self.weights[:, ::-1].T.ravel()
-        # Weights of 0 at the ends, because an even factor puts no pixel so far from its neighbour.
+        # The weights at the ends are 0, because no pixel of an even factor is that far from its
+        # neighbour.
         half = self.factor // 2
         taps = taps[half:-half]
         weight = np.eye(channels)[:, :, None, None] * np.outer(taps, taps)

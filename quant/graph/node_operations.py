@@ -63,7 +63,7 @@ def _read_conv(node: Node, graph: OnnxGraph) -> Op:
         # Simplification has made one group of several.
         groups = 1
         _check_transposed(node)
-    # A DPU has one group or one a channel: its tools leave others to the processor.
+    # A DPU has one group, or one for each channel. Its tools leave other numbers to the processor.
     depthwise = groups == len(weight) and weight.shape[1] == 1
     require(
         groups == 1 or depthwise,
@@ -149,7 +149,7 @@ def _read_resize(node: Node, graph: OnnxGraph) -> Op:
         f"must enlarge by an integer factor, got {resizing.factors[2]:g}",
         SHRINK if resizing.factors[2] < 1 else PAD_STRIDES,
     )
-    # A DPU enlarges bilinearly by 2 and 4 alone where centres are half-pixel ones.
+    # A DPU enlarges bilinearly only by 2 and 4 with half-pixel centres.
     if resizing.mode == "linear":
         require(
             resizing.is_half_pixel and factor in (2, 4),
@@ -179,7 +179,7 @@ def _read_shuffle(node: Node, _: OnnxGraph) -> Op:
     )
     up = node.op_type == "DepthToSpace"
     block = int(node.attributes["blocksize"])
-    # Of several nodes that spell one shuffle it is the last one's name.
+    # If several nodes express one shuffle, it is named after the last one.
     name = node.proto.name or node.name
     return Shuffle(name, node.source, node.result, block, up, ORDERS[mode])
 

@@ -323,8 +323,8 @@ def read_planes(graph: Graph, full_scale: np.ndarray | None = None) -> Graph:
     for op in fold_full_scale(graph, full_scale):
         if isinstance(op, Conv) and op.input == IMAGE:
             weight = op.weight
-            # Each result of a depthwise convolution reads several planes of its channel, which a
-            # depthwise one cannot, so it becomes an ordinary one with zeros for the other channels.
+            # Each result of a depthwise convolution reads several planes of its channel, so it
+            # becomes an ordinary convolution with zeros for the other channels.
             if op.groups != 1:
                 weight = weight * np.eye(op.groups, dtype=np.float32)[:, :, None, None]
             # The third plane only makes the steps of the weights finer: in float it adds nothing.

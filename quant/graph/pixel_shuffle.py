@@ -57,7 +57,7 @@ def with_shuffles(model: ModelProto) -> OnnxGraph:
     if not chains:
         return graph
     types = graph.tensor_types()
-    # The last node of a chain stands for all of them, so that no reader of the result moves.
+    # The last node stands for its chain, so that readers of the result need not change.
     replacements: dict[Node, list[Node]] = {}
     for chain in chains.values():
         sizes = sizes_of(types.get(chain[0].source, TypeProto.Tensor()))
@@ -124,7 +124,7 @@ def _growth(result: np.ndarray, shape: tuple[int, int, int, int]) -> Fraction | 
     growth = Fraction(result.shape[2], shape[2])
     rows, columns = (source // growth.denominator for source in np.unravel_index(result, shape)[2:])
     down, across = (np.arange(side) // growth.numerator for side in result.shape[2:])
-    # Numerator or denominator is 1 where blocks become pixels or pixels become blocks.
+    # The numerator or the denominator is 1 if blocks become pixels, or pixels become blocks.
     in_blocks = 1 in (growth.numerator, growth.denominator)
     in_place = (rows == down[:, None]).all() and (columns == across).all()
     return growth if in_blocks and in_place else None

@@ -269,7 +269,8 @@ class Integers:
             writes_int8 = rounds or self._reads(node, self._int8)
         if node.op_type == "DequantizeLinear":
             aliases = self._dequantised if self.constant(source) is None else self._same
-            # At once, because each reader would walk a chain of aliases again.
+            # This is done at once, because otherwise each reader would follow a chain of aliases
+            # again.
             aliases[result] = self.resolve(source)
         elif node.op_type == "QuantizeLinear" and source in self._wide:
             self._int8.add(result)

@@ -109,7 +109,7 @@ def read_network(model: ModelProto) -> SplitNetwork:
             adds_image=network.adds_image or reader.end.base is not None,
         )
         check_network(network)
-    # Last, because what else is refused would be after adapting as well.
+    # Last, because any other error would remain after adapting.
     if reader.adaptable is not None:
         raise reader.adaptable
     return network
@@ -121,7 +121,7 @@ def refusal(model: ModelProto) -> str:
         check_runnable(model, "the float network")
         read_network(model)
     except ModelError as error:
-        # `check` calls this, so its user need not be sent to `check`.
+        # `check` calls this too, and need not be recommended to its own user.
         return str(error).removesuffix(f" {REMEDY}")
     return ""
 
@@ -304,8 +304,8 @@ class _Reader:
             # A DPU computes no activation but ReLU behind a sum of two tensors.
             excluded = set(Activation) - {Activation.relu}
         elif isinstance(producer, Conv) and producer.transposed:
-            # The host computes LeakyReLU on a convolution's own sums, which a transposed one has in
-            # phases.
+            # The host's file computes LeakyReLU on the sums of a convolution. A transposed one has
+            # them in phases.
             excluded.add(Activation.leaky_relu)
         if (
             place is not None

@@ -33,7 +33,7 @@ def host_part_to_json(part: HostPart) -> dict[str, Any]:
     record = asdict(part)
     # Encoding and decoding are described by the flags that the first files had.
     del record["encoding"], record["decoding"]
-    # What few networks have is described only for these.
+    # Properties that few networks have are described only for these.
     for name in ("input_ranges", "limits", "activation", "crop_px"):
         if not record[name]:
             del record[name]

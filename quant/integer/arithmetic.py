@@ -39,15 +39,15 @@ def convolve(
         The sums, (N, O, H', W') int64.
     """
     if transposed:
-        # A transposed convolution is one of stride 1 over the pixels with zeros between them, its
-        # kernel turned.
+        # A transposed convolution is a convolution of stride 1 over the pixels with zeros between
+        # them, by a rotated kernel.
         rows, columns = window.strides
         count, channels, height, width = image.shape
         spread = (count, channels, (height - 1) * rows + 1, (width - 1) * columns + 1)
         between = np.zeros(spread, image.dtype)
         between[:, :, ::rows, ::columns] = image
         image = between
-        # Its padding crops the result, so it takes off the full padding k - 1.
+        # Its padding crops the result, so it is subtracted from the full padding k - 1.
         top, left, bottom, right = window.pads
         tall, broad = (k - 1 for k in weight.shape[2:])
         window = Window(pads=(tall - top, broad - left, tall - bottom, broad - right))

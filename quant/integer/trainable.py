@@ -68,7 +68,7 @@ def to_int8(values: Tensor, low: int = INT8_MIN, high: int = INT8_MAX) -> Tensor
     """
     # hardtanh has slope 0 outside its limits, so a value must pass as long as it rounds to an end.
     clipped = functional.hardtanh(values, low - NEAR, high + NEAR)
-    # Rounding `data` is unseen by autograd: backwards it counts as the identity.
+    # autograd does not see that `data` is rounded: backwards the rounding is the identity.
     clipped.data.round_()
     return clipped
 
@@ -239,7 +239,7 @@ def _lift(activation: Activation = Activation.none) -> float:
     It is smaller for LeakyReLU, which divides the unit by 128 and, by its slope, the offset by
     about ten.
     """
-    # Sums are integers in their unit, so less than 1 moves none but ties across a threshold.
+    # Sums are integers in their unit, so a shift of less than 1 moves only ties across a threshold.
     return 2.0**-5 if activation is Activation.leaky_relu else 2.0**-2
 
 
@@ -363,16 +363,9 @@ def _all_copies(
 ) -> tuple[IntConv, HostPart]:
     """Change all copies of the result as the trained one changed, each in proportion to its gain.
 
-    The bias of a window changes the host's offsets instead.
-
-    Args:
-        last: the last convolution, with all copies before the training.
-        host_part: the host's part before the training.
-        weight: (O, I, kh, kw) the integer weights of the trained copy.
-        bias: (O,) its integer bias; that of a window in units of its scale, with the offset.
-
-    Returns:
-        The last convolution and the host's part after the training.
+    `last` and `host_part` are those before the training. `weight` (O, I, kh, kw) and `bias` (O,)
+    are the integers of the trained copy. The bias of a window, in units of its scale and with the
+    offset, changes the host's offsets instead.
     """
     one = _one_copy(last, host_part)
     decoding = host_part.decoding

@@ -197,8 +197,8 @@ class OnnxGraph:
         self.types = {name: tensor.elem_type for name, tensor in inputs.items()}
         self.result_sizes = {v.name: sizes_of(v.type.tensor_type) for v in model.graph.output}
         self.outputs = tuple(value.name for value in model.graph.output)
-        # Of each name in use how many others were derived from it, so that a thousand nodes of one
-        # name do not try each other's.
+        # The number of names derived from each name, so that a thousand nodes of one name do not
+        # try each other's.
         self._name_counts = dict.fromkeys(self.constants, 0)
         for node in nodes:
             self._name_counts.update(dict.fromkeys((*node.inputs, *node.outputs), 0))
@@ -228,7 +228,7 @@ class OnnxGraph:
         for node in self.nodes:
             replacement = rewriting(self, node)
             new_nodes = [node] if replacement is None else replacement
-            # At once, because the pass looks up the writers of what later nodes read.
+            # At once, because the pass looks up the writers of tensors that later nodes read.
             for new in new_nodes:
                 self.writers.update((name, new) for name in new.outputs if name)
             nodes += new_nodes

@@ -62,8 +62,8 @@ def check_runnable(model: ModelProto, where: str) -> None:
         raise ModelError(
             f"{where} has sparse weights, which are not supported. Export it without them."
         )
-    # What follows from the image is sized by it; what follows from constants alone may have any
-    # size.
+    # Tensors that depend on the image are limited by its size. Those that depend only on constants
+    # may have any size.
     arrays = constants(model)
     of_image = {value.name for value in model.graph.input} - arrays.keys()
     filled_values = 0
@@ -130,10 +130,10 @@ def _computed(
     is_short = all(value is not None and value.size <= LIST_VALUES for value in values)
     is_weight = node.op_type in NORMALIZING and _keeps_size(node.op_type, values)
     if (node.op_type in COMPUTED and is_short) or is_weight:
-        # Importing it takes half a second, which only files that compute sizes should cost.
+        # Importing it takes half a second, which only files that compute sizes should pay.
         from onnx.reference import ReferenceEvaluator
 
-        # Whatever the reference raises of a node that contradicts itself means: not known.
+        # If the reference raises any error for a contradictory node, the value is not known.
         with np.errstate(all="ignore"), suppress(Exception):
             feeds = dict(zip(node.input, values, strict=True))
             evaluator = ReferenceEvaluator(node, opsets={"": opset})

@@ -83,6 +83,7 @@ class Window:
                 total[axis] = max(beyond + -size[axis] % stride, 0)
         less = [t // 2 for t in total]
         more = [t - t // 2 for t in total]
-        # Of an odd number SAME_LOWER puts the extra pixel before the map, SAME_UPPER behind it.
+        # If the number is odd, SAME_LOWER puts the extra pixel before the map, SAME_UPPER behind
+        # it.
         begin, end = (more, less) if auto_pad == "SAME_LOWER" else (less, more)
         return replace(self, pads=(begin[0], begin[1], end[0], end[1]))

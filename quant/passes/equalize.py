@@ -75,13 +75,12 @@ def equalize(graph: Graph, group: ResidualGroup, factors: np.ndarray) -> Graph:
         if not op.scalable:
             factors[part] = 1.0
         if op.activation is Activation.relu6:
-            # 2. Below this factor int8 would end beyond the six, and ReLU could not stand for
-            # ReLU6.
+            # 2. Below this factor int8 would end above six, and ReLU could not replace ReLU6.
             factors[part] = np.maximum(factors[part], FULL / op.ceilings)
     return tuple(
         _scaled(op, factors, group)
         if isinstance(op, Conv) and group.keys() & {op.input, op.output}
-        # Left as the same object, so that it is not rounded again.
+        # It remains the same object, so that it is not rounded again.
         else op
         for op in graph
     )
@@ -135,7 +134,8 @@ def channel_ranges(
         for name, sizes in zip(names, zip(*tiles, strict=True), strict=True)
     }
     ranges = np.zeros(max(group[name].stop or len(mean) for name, mean in means.items()))
-    # Tensors of a group share their factors, so a channel's range is its widest in any of them.
+    # Tensors of a group share their factors, so the range of a channel is its largest in any of
+    # them.
     for name, mean in means.items():
         ranges[group[name]] = np.maximum(ranges[group[name]], mean)
     return above_dead(ranges)

@@ -277,9 +277,10 @@ def descend(
             square = gradient.square()
             mean.lerp_(gradient, 1 - MOMENTUM)
             mean_square.lerp_(square.mean() if pace.by_tensor else square, 1 - STEADINESS)
-            # Running means start at 0, which their share of the truth corrects.
+            # Running means start at 0. Both divisors correct that.
             root = (mean_square / (1 - STEADINESS ** (taken + 1))).sqrt()
-            # Without references errors and gradients are small: what is added must be smaller.
+            # Without references, errors and gradients are small, so the number added to the root is
+            # smaller.
             move = mean / (1 - MOMENTUM ** (taken + 1)) / (root + 1e-15)
             parameter.data.sub_(rate * move)
         yield steps - taken - 1
@@ -296,7 +297,7 @@ def _batches(samples: Sequence[Sample]) -> list[Sample]:
 
 def _averaged(average: Tensor, number: Tensor, count: Tensor | int) -> Tensor:
     """Return the running average after one more step; `count` is the number of steps before it."""
-    # Early steps leave the start behind sooner, so that short rounds train at all.
+    # The average follows early steps faster, so that short rounds train at all.
     decay = min(DECAY, (int(count) + 1) / (int(count) + 10))
     return average.lerp(number, 1 - decay)
 
@@ -315,7 +316,7 @@ def loss_of(core: IntCore, samples: Sequence[Sample]) -> float:
     host_part = replace(core.host_part, back=(), adds_image=False, last=(), limits=())
     session = open_session(host_model(replace(core, host_part=host_part), {}))
     errors = [float(s.error(torch.from_numpy(result_of(session, s.image)))) for s in samples]
-    # The float network errs from a reference as well, and no integers can be blamed for that.
+    # The error of the float network is subtracted, because the integers do not cause it.
     in_float = [float(sample.error(sample.floats)) for sample in samples]
     return float(np.mean(errors)) - float(np.mean(in_float))
 
@@ -354,7 +355,7 @@ def _samples(host_part: HostPart, full: Graph, tuning: Tuning) -> Iterator[Sampl
                 "references of the size of the results."
             )
         target = torch.from_numpy(host_part.correction_of(image, reference))
-        # Over the float network's own error, dark and busy patches count alike.
+        # Errors are divided by the float network's own, so that dark and busy patches count alike.
         weight = 1 / max(float(_inner_error(result, target)), LEAST_ERROR)
         yield Sample(image, planes, result, target, weight)
 
@@ -374,7 +375,7 @@ def _inner_error(result: Tensor, target: Tensor, weight: float | Tensor = 1.0) -
     Returns:
         A tensor of one number. A small result is compared as a whole.
     """
-    # In a small result the border would be most of it.
+    # In a small result, most pixels would belong to the border.
     border_px = BORDER_PX if min(result.shape[2:]) >= 4 * BORDER_PX else 0
     height, width = result.shape[2:]
     inner = (result - target)[..., border_px : height - border_px, border_px : width - border_px]

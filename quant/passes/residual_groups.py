@@ -130,7 +130,7 @@ def exceeds_six(graph: Graph, group: ResidualGroup, frac_bits: Mapping[str, int]
         isinstance(op, Conv) and op.activation is Activation.relu6 and op.output in group
         for op in graph
     )
-    # Where int8 ends beyond the six there are larger sums, and its end cannot serve as their clip.
+    # If int8 ends above six, there are larger sums, and its end cannot replace their clip.
     return clipped and any(INT8_MAX * 2.0 ** -frac_bits[name] > SIX for name in group)
 
 

@@ -222,8 +222,8 @@ class CropTrials:
 
         def trial(candidate: Graph) -> Costs:
             rounded = self.core_of(candidate)
-            # Convolutions that were not rounded again are the same objects. A scale that has to
-            # move may move others, also far from what was changed.
+            # Convolutions that were not rounded again are the same objects. If one scale has to
+            # change, others may follow, also far from the change.
             same = [a is b for a, b in zip(core.ops, rounded.ops, strict=True)]
             moved = {name for name, _ in core.frac_bits.items() ^ rounded.frac_bits.items()}
             if all(same[:start]) and all(same[stop:]) and moved <= within:

@@ -283,7 +283,7 @@ def _valid_image(name: str, image: np.ndarray, channels: int, ranges: Ranges | N
             f"The values of {name} must be in `input_range`, {in_words(ranges or (UNIT,))}, but "
             f"they are {values.min():.4g} to {values.max():.4g}. State a range that holds them."
         )
-    # What rounding has left outside, within the tolerance of LARGEST.
+    # Values that rounding has moved outside, within the tolerance of LARGEST.
     return np.clip(values, 0, 1) if within and not ranges else values
 
 

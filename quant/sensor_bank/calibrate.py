@@ -90,7 +90,8 @@ def _analytic(scale: int, result: int, shifts: Shifts, decoding: BankSum, inputs
     for k, share in enumerate(np.diff(edges)):
         weight[:fine, rows, inputs - COPIES[2] + k, rows] = share
     weight[fine:, rows, inputs - 1, rows] = 2**shift if decoding.coarse_copies else 0
-    # Rounded at other places of a step each time, the copies hold together what one cannot.
+    # Each copy is rounded at another place of a step, so that together they represent what one
+    # cannot.
     offsets = spread_over_a_step(fine) + [0.0] * decoding.coarse_copies
     bias = quantize_bias(np.repeat(offsets, pixels) * 2.0**-result, shift + result, shifts)
     flat = weight.reshape(ANALYTIC_COPIES * pixels, -1, 1, 1)

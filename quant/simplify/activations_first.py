@@ -50,7 +50,7 @@ def activations_first(model: ModelProto) -> ModelProto:
         return model
     network = deepcopy(model)
     graph = OnnxGraph(network)
-    # Each time an activation passes one operation, which is then not needed in its old place.
+    # In each round an activation passes one operation, and is removed from its old place.
     while _any_moves(graph):
         graph.rewrite(move_in_front)
         graph.save()

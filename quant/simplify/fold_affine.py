@@ -58,7 +58,7 @@ def add_negated(graph: OnnxGraph, node: Node) -> list[Node] | None:
     result = node.result
     before = graph.sole_writer(node.inputs[1])
     if before is not None and is_convolution(graph, before):
-        # At once, so that the tensor keeps its name.
+        # This is done at once, so that the tensor keeps its name.
         _fold(graph, before, Affine(-np.ones(1), np.zeros(1)), into_results=True)
         return [Node.new("Add", node.inputs, result, node.proto.name)]
     name = f"{result}.negated"
@@ -136,7 +136,7 @@ def convolve_affine(graph: OnnxGraph, node: Node) -> list[Node] | None:
         The convolution, or an empty list if the node can now be folded into the convolution in
         front of it. None if the node stays.
     """
-    # What stands in front may just have become a convolution, which takes this one in.
+    # The operator in front may just have become a convolution, which this one can be folded into.
     replacement = fold_behind(graph, node)
     match = affine_of(graph, node)
     channels = graph.channels(match[0]) if match is not None else 0
@@ -301,7 +301,6 @@ def _may_take_in(graph: OnnxGraph, node: Node, name: str, affine: Affine) -> boo
     attributes = node.attributes
     states_pads = attributes.get("auto_pad", "NOTSET") in ("NOTSET", "VALID")
     unpadded = node.op_type == "Conv" and states_pads and not any(attributes.get("pads", []))
-    # Zeros that a convolution pads with are not shifted, so a shift passes one without padding
-    # alone.
+    # The zeros of a padding are not shifted, so a shift passes only a convolution without padding.
     exact = unpadded or not affine.shift.any()
     return is_convolution(graph, node) and node.inputs.count(name) == 1 and exact

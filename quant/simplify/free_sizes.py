@@ -222,7 +222,7 @@ def _expanded(graph: OnnxGraph, node: Node) -> list[Node] | None:
 def _is_broadcast_anyway(graph: OnnxGraph, node: Node) -> bool:
     """Return True if all readers of an Expand are arithmetic that broadcasts to the same size."""
     result = node.result
-    # What another Expand enlarges may be small itself, so it does not count.
+    # The source of another Expand may be small itself, so it does not count.
     large = {
         name
         for name, size in graph.shapes.items()

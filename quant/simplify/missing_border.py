@@ -48,7 +48,7 @@ def with_missing_border(model: ModelProto) -> ModelProto:
     if not border_px:
         return model
     network = deepcopy(model)
-    # The sizes that a file of a fixed size states are those without the border.
+    # A file of a fixed size states the sizes without the border.
     network.graph.ClearField("value_info")
     for dim in network.graph.output[0].type.tensor_type.shape.dim[2:]:
         dim.Clear()

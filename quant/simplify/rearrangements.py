@@ -81,7 +81,7 @@ def rearranged(graph: OnnxGraph, node: Node) -> list[Node] | None:
         return None
     blocks = image.reshape(-1, channels, after[2], block, after[3], block)
     blocks = blocks.transpose(0, 1, 3, 5, 2, 4).reshape(before[0], -1, *after[2:])
-    # The numbers grow from channel to channel, and from place to place.
+    # The numbers increase from channel to channel, and from place to place.
     order = np.searchsorted(blocks[0, :, 0, 0], moved[0, :, 0, 0]) % blocks.shape[1]
     if not np.array_equal(blocks[:, order], moved):
         return None

@@ -178,7 +178,7 @@ def _run_passes(model: ModelProto) -> None:
         drop_where,
     ):
         graph.rewrite(replacement)
-    # What was replaced would count as a reader.
+    # Nodes that were replaced would count as readers.
     graph.save()
     graph.shapes = float_shapes(graph)
     for rewriting in (
@@ -209,7 +209,7 @@ def _run_passes(model: ModelProto) -> None:
         unshuffle_slices,
         split_channels,
         convolve_slice,
-        # A normalisation that has become a convolution takes in what stands around it.
+        # A normalisation that has become a convolution absorbs the operators around it.
         fold_behind,
     ):
         graph.rewrite(with_shapes)
@@ -262,7 +262,7 @@ def _to_float32(model: ModelProto) -> None:
             value.type.tensor_type.elem_type = TensorProto.FLOAT
     for tensor in held_tensors(graph):
         if tensor.data_type in OTHER_FLOATS:
-            # What overflows is infinite, and is refused as such.
+            # Values that overflow are infinite, and are refused as such.
             with np.errstate(over="ignore"):
                 values = numpy_helper.to_array(tensor).astype(np.float32)
             tensor.CopyFrom(numpy_helper.from_array(values, tensor.name))
@@ -278,7 +278,7 @@ def _folded(model: ModelProto, where: str) -> ModelProto:
     options = ort.SessionOptions()
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_BASIC
     options.intra_op_num_threads = 1
-    # What fails is raised, so that a message of the runtime would say it twice.
+    # Failures are raised, so the runtime need not print them as well.
     options.log_severity_level = 4
     network = ModelProto()
     with TemporaryDirectory() as folder:

@@ -333,7 +333,7 @@ def shrink_by_convolution(graph: OnnxGraph, node: Node) -> list[Node] | None:
     block = round(1 / factor)
     if not np.isclose(block * factor, 1, atol=1e-6):
         return None
-    # The place in a block that the result is interpolated at.
+    # The place in a block at which the result is interpolated.
     place = PLACES[resizing.where](0, factor)
     if resizing.mode == "nearest":
         place = ROUNDINGS[resizing.rounding](place)

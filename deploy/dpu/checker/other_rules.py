@@ -194,7 +194,8 @@ def activation_place(op: Operation, dpu: Dpu) -> Finding | None:
     {activations[alone]} ({activations[alone].source}).
     """
     place = PLACE.get(op.follows or "")
-    # `quantize` lets a convolution copy the image, mirrored or not, for what reads it and is none.
+    # If another operator than a convolution reads the image, `quantize` inserts a convolution that
+    # copies the image, mirrored or not.
     if op.follows in (None, "pad") and not op.integer:
         place = "conv"
     fused = dpu.target.activations[place].value if place else ()

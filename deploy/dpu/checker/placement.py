@@ -155,7 +155,7 @@ def place(network: SizedGraph, dpu: Dpu) -> Placement:
     parts = _parts(network)
     pairs = zip(network.operations, parts, strict=True)
     broken = [judge(op, dpu, network.quantized) if part == "dpu-core" else () for op, part in pairs]
-    # In a float file a cut at an end costs time and no more.
+    # In a float file a cut at an end only costs time.
     if not network.quantized:
         before = _reached(network.operations, _convolved(network), forwards=False)
         cpu_results: set[str] = set()
@@ -207,7 +207,7 @@ def _parts(network: SizedGraph) -> list[Part]:
     for op in operations:
         leads = op.output not in behind
         trails = op.output not in before
-        # An operator that no processor here computes is not the host's either.
+        # The host cannot run an operator that no processor here computes.
         if is_foreign(op.op_type):
             parts.append("dpu-core")
         elif leads and _is_host_front(op, network, trails=trails):

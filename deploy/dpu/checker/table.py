@@ -147,7 +147,7 @@ ACCEPTED = "networks that 'quantize' refuses"
 
 def _refusal(model: onnx.ModelProto) -> str:
     """Return why `quantize` refuses a float network or its input; "" if it accepts both."""
-    # First, because a file that is refused may have weights among its inputs.
+    # First, because the inputs of a file that is refused may include weights.
     if reason := refusal(model):
         return reason
     try:
@@ -166,7 +166,7 @@ def _rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:
     texts = remarks_on(placement, dpu, tile_px)
     remarks = [Row("remarks", name, {}, {"remark": text}) for name, text in texts.items()]
     refusals = {"nodes refused": _count(len(placement.failed), "node")}
-    # Into which parts an NPU's compiler cuts a network is not known.
+    # It is not known into which parts an NPU's compiler cuts a network.
     if npu:
         return [*nodes, *remarks, Row("summary", "placement", refusals)]
     parts = {"DPU subgraphs": _count(placement.dpu_subgraphs, "subgraph")}

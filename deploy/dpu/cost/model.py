@@ -157,7 +157,7 @@ class Layers:
             )
             for work in works
         ]
-        # The ten fields, also of a network without layers: an empty list alone has one axis.
+        # The shape also keeps the ten fields of a network without layers.
         return cls(*np.array(rows, dtype=np.float64).reshape(-1, 10).T)
 
     def compute_s(self, constants: Constants) -> Array:
@@ -205,7 +205,7 @@ class Layers:
         """
         compute = self.compute_s(constants)
         memory = self.memory_s(constants, alone=alone)
-        # What the longer of the two hides of the shorter counts for neither.
+        # The part of the shorter time that the longer one hides counts for neither.
         exposed = 1 - structure.overlap
         compute_s = np.where(compute >= memory, compute, exposed * compute)
         memory_s = np.where(compute >= memory, exposed * memory, memory)
@@ -243,7 +243,7 @@ def shares_of(dpu_s: Array, host_s: Array, contention_exponent: float) -> Array:
     follows_host = host**contention_exponent / (
         host**contention_exponent + dpu**contention_exponent
     )
-    # Where the rates are those of the DPU alone the host takes no time.
+    # Published rates of the DPU alone include no time of the host.
     host_shares = np.divide(host_s, host, out=np.zeros_like(host_s), where=host > 0)
     parts = [(1 - follows_host) * dpu_s / dpu, follows_host * host_shares]
     return np.concatenate(parts, axis=1)
@@ -261,7 +261,7 @@ def frame_rate(dpu_s: float, host_s: float, contention_exponent: float) -> float
     """
     longer = max(dpu_s, host_s)
     shorter = min(dpu_s, host_s)
-    # (dpu^q + host^q)^(1/q) with the longer time factored out: no power leaves the floats' range.
+    # (dpu^q + host^q)^(1/q), divided by the longer time so that no power overflows.
     return float(
         1 / (longer * (1 + (shorter / longer) ** contention_exponent) ** (1 / contention_exponent))
     )

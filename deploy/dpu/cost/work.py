@@ -124,7 +124,7 @@ def _array_operations(op: Operation, dpu: Dpu) -> int:
         return 0
     strides = op.window.strides if op.kind == "transposed" else (1, 1)
     channels, *sides = op.out_shape
-    # The phases run with one size of kernel: where the stride does not divide it, it is filled up.
+    # All phases have one kernel size. If the stride does not divide the kernel, it is filled up.
     height, width = map(groups_of, sides, strides)
     rows, columns = map(groups_of, op.kernel, strides)
     pixels = _positions(
@@ -226,10 +226,11 @@ class _Flow:
         An add is fused with the operation that writes one of its operands. That operand and the
         inputs of that operation are on the chip, so they are not read again.
         """
-        # A concat computes nothing: its operands were stored where it joins them.
+        # A concat computes nothing: its operands were stored at their places in the result.
         if op.kind == "concat":
             return 0
-        # The operand was read before, or made before: neither stays on the chip.
+        # The operand was read before, or computed earlier. In both cases it is no longer on the
+        # chip.
         if self.serial(op):
             return _size(op.out_shape)
         here = set()
@@ -272,7 +273,7 @@ class _Flow:
 
     def _fits(self, root: str) -> bool:
         shape = self._shapes.get(root)
-        # In the banks channels are filled up to the lanes too.
+        # In the banks, channels are filled up to the number of lanes.
         return shape is None or _up(shape[0], self._lanes) * shape[1] * shape[2] <= self._bank_bytes
 
     def _root(self, name: str) -> str:

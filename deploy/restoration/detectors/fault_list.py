@@ -160,7 +160,7 @@ def read_list(path: Path, raster: Raster) -> FaultList:
                 f"{counted(raster.bands, 'band')}. Count columns and rows from 0, and bands from 1."
             )
         faults.add(Fault(column, row, band))
-    # A list that a run found empty has its header alone.
+    # If a run finds no faults, its list has only a header.
     if not faults and not any(HEADER_LINE.fullmatch(line) for line in lines):
         raise OptionError(
             f"`fix_detectors` must be '{FOUND}' or a list of faulty detectors, but {path} {reason}."

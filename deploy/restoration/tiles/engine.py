@@ -133,7 +133,7 @@ class Restorer:
         """
         missing = self._missing(strip, place)
         if missing is not None and missing.all():
-            # The network would restore nothing but what fills missing pixels.
+            # All pixels would be filled in, so there is nothing to restore.
             return Tile(np.full(missing.shape, np.nan, np.float32), Tally())
         network = self.networks[place.group % len(self.networks)]
         window = self._window(strip, place)
@@ -182,7 +182,7 @@ class Restorer:
             pixels = np.clip(network_pixels + change, 0, np.float32(self.full_scale))
             squares = np.square((pixels - network_pixels) / self.full_scale)
             squared = float(np.nansum(squares, dtype=np.float64))
-            # The doubts about a result are about what the network returned, before this step.
+            # Doubts about a result refer to the network's output, before this step.
             tally = replace(
                 tally_of(pixels),
                 change_squared=squared,
@@ -386,7 +386,7 @@ def _along_rows(
     same distance the left one is used.
     """
     width = pixels.shape[1]
-    # Without a known pixel on one side, its place is out of reach from every pixel.
+    # If there is no known pixel on one side, its place is out of reach of every pixel.
     far = width + reach_px + 1
     here = np.arange(width)
     left = np.maximum.accumulate(np.where(missing, -far, here), axis=1)

@@ -133,7 +133,7 @@ def match(truth: Boxes, detected: Boxes) -> tuple[np.ndarray, np.ndarray, np.nda
         # An object is found once; an ignored box may hold any number of detections.
         free = (overlaps[one] >= OVERLAPS[:, None]) & ~(matched & ~truth.ignored)
         at = np.nonzero(free.any(axis=-1))
-        # An object that counts goes first: 1 is added to its overlap, which is at most 1.
+        # Objects that count take precedence: 1 is added to their overlap, which is at most 1.
         preference = np.where(free, overlaps[one] + ~uncounted, 0.0)
         best = preference.argmax(axis=-1)[at]
         hits[*at, one] = ~uncounted[*at, best]

@@ -125,8 +125,8 @@ def iou(one: np.ndarray, other: np.ndarray, ignored: np.ndarray | bool = False) 
     high = np.minimum(one[:, None, 2:], other[None, :, 2:])
     shared = np.prod(np.maximum(high - low, 0), axis=2)
     own = areas(one)[:, None]
-    # Of an ignored box the overlap is the share of the detection inside it, as COCO has it for
-    # crowds.
+    # For an ignored box, the overlap is the share of the detection inside it, as COCO defines it
+    # for crowds.
     union = np.where(ignored, own, own + areas(other) - shared)
     return np.asarray(np.divide(shared, union, out=np.zeros_like(shared), where=union > 0))
 
@@ -183,8 +183,8 @@ class Letterbox:
         top = (size_px - height) // 2
         left = (size_px - width) // 2
         self._border = (top, size_px - height - top), (left, size_px - width - left), (0, 0)
-        # By axis, for the sides are rounded to whole pixels: one gain for both would be off by up
-        # to half a pixel.
+        # Each axis has its own gain, because the sides are rounded to whole pixels: one gain for
+        # both would be off by up to half a pixel.
         self._gain = np.tile([width / width_px, height / height_px], 2)
         self._shift = np.tile([left, top], 2)
 

@@ -158,7 +158,7 @@ class Trial:
         numbers = np.empty(len(sites), int)
         for site in np.unique(sites):
             here = sites == site
-            # A single site has no others, so its own images choose, which favours the ground.
+            # If there is only one site, its own images choose. That favours the ground.
             judges = here if here.all() else ~here
             numbers[here] = self.ground_db[:, judges].mean(1).argmax()
         return numbers

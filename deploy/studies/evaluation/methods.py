@@ -239,6 +239,6 @@ def profile_of(sensor: Instrument, like: Sensor) -> Sensor:
     constants = {
         name: Constant(value, "assumed", "a sensor drawn") for name, value in numbers.items()
     }
-    # The sensor has alpha and beta: SNRs would have them drawn again.
+    # The noise is stated by alpha and beta, which exclude SNRs.
     noise = {"snr_0": None, "snr_1": None}
     return like.with_fields(name="drawn", **constants, **noise, response=sensor.response)

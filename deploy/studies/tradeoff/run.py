@@ -182,7 +182,7 @@ def run_tradeoff(study: Study) -> Tradeoff:
     benchmark, remarks = benchmark_of(study)
     results = _measured(points, benchmark, Swath(*study.size))
     if PAPER_TARGET in study.board_names and study.size == parse_size(PAPER_SIZE):
-        # The rows stand as printed: the paper's images are others.
+        # The published rows are not corrected to these images, because the paper used others.
         for row in published_rows():
             figures = {f"board {key}": figure for key, figure in row.figures.items()}
             results.append(Measured(row.name, figures, {"board": PAPER_TARGET}))
