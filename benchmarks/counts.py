@@ -56,7 +56,7 @@ class Counts(NamedTuple):
 
     @property
     def density(self) -> float:
-        """Return the number of tokens per line."""
+        """The number of tokens per line."""
         return self.tokens / self.lines
 
 

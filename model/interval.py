@@ -131,7 +131,7 @@ class Conditions:
         )
 
     def terms(self, noise: Array, detail: Array) -> list[Array]:
-        """Return what each of the exponents multiplies, in the order of their fields.
+        """Return the factor of each exponent, in the order of their fields.
 
         Args:
             noise: sigma of each pixel.
@@ -250,8 +250,8 @@ class HalfWidth:
 
         Args:
             restored: (h, w) pixel values as they are stored.
-            known: which of them are not missing, (h, w). Missing ones and what lies beyond the
-                array are in no window.
+            known: True for each that is not missing, (h, w). Missing pixels, and those beyond the
+                array, are in no window.
 
         Returns:
             (h, w) half-widths, NaN where a pixel is missing.

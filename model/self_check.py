@@ -108,12 +108,12 @@ class Judged:
 
     @property
     def outside(self) -> NDArray[np.bool_]:
-        """Return True for each block whose residual is more than noise."""
+        """True for each block whose residual is more than noise."""
         return self.chi2 > MOST_CHI2 + MOST_PER_SHARPENING * self.sharpening
 
     @property
     def decidable(self) -> NDArray[np.bool_]:
-        """Return True for each block that would show a wrong restoration, or shows one."""
+        """True for each block that would show a wrong restoration, or shows one."""
         return (self.sharpening >= LEAST_SHARPENING) | self.outside
 
 

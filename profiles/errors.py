@@ -144,7 +144,7 @@ def require_numbers(name: str, value: object) -> None:
 
     Args:
         name: the name of the parameter, for the message.
-        value: what was given; anything else is left to NumPy.
+        value: the value. NumPy judges anything but a text, a path and None.
     """
     if value is None or isinstance(value, str | bytes | os.PathLike):
         raise ImageError(

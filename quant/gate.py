@@ -299,7 +299,7 @@ def unfit_reference(patches: Patches, number: int, purpose: str) -> ImageError:
     Args:
         patches: the samples.
         number: the place of the sample among them.
-        purpose: what needs the reference, for the message, such as "the mean PSNR".
+        purpose: the figure that needs the reference, for the message, such as "the mean PSNR".
     """
     shape = patches.pairs[number][1].shape
     fault = f"its reference has {times(shape[1:])}" if math.prod(shape) else "it has none"

@@ -27,7 +27,7 @@ class Tensor:
 
     @property
     def channels(self) -> int:
-        """Return the number of channels."""
+        """The number of channels."""
         return self.shape[0]
 
 

@@ -83,7 +83,7 @@ class Cases:
 
     @cached_property
     def layers(self) -> Layers:
-        """Return the layers of all networks, concatenated."""
+        """The layers of all networks, concatenated."""
         parts = [row.layers for row in self.rows]
         return Layers(
             *(
@@ -102,29 +102,29 @@ class Cases:
 
     @cached_property
     def families(self) -> NDArray[np.str_]:
-        """Return the family of each case, (n,)."""
+        """The family of each case, (n,)."""
         return np.array([row.family for row in self.rows])
 
     @cached_property
     def host_cores(self) -> Array:
-        """Return the number of cores of the board's processor, (n,)."""
+        """The number of cores of the board's processor, (n,)."""
         return np.array([row.host_cores for row in self.rows], float)
 
     @cached_property
     def observed(self) -> Array:
-        """Return the mean ln(FPS) with several threads, (n,)."""
+        """The mean ln(FPS) with several threads, (n,)."""
         return np.array([np.log(row.fps).mean() for row in self.rows])
 
     @cached_property
     def observed_single(self) -> Array:
-        """Return the mean ln(FPS) with one thread, (n,), or NaN where no such rate is published."""
+        """The mean ln(FPS) with one thread, (n,), or NaN where no such rate is published."""
         return np.array(
             [np.log(row.fps_single).mean() if row.fps_single else np.nan for row in self.rows]
         )
 
     @cached_property
     def weights(self) -> Array:
-        """Return the weights of the rates with several threads and with one, (2 n,).
+        """The weights of the rates with several threads and with one, (2 n,).
 
         All cases of a network together count once.
         """

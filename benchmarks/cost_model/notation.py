@@ -104,17 +104,17 @@ class Entry:
 
     @property
     def family(self) -> str:
-        """Return the name of the family, whose networks resemble one another."""
+        """The name of the family, whose networks resemble one another."""
         return self.header["family"]
 
     @property
     def host(self) -> Task | None:
-        """Return the host's task with the results, or None if the rates are the DPU's alone."""
+        """The host's task with the results, or None if the rates are the DPU's alone."""
         return next((task for task in get_args(Task) if task == self.header["host"]), None)
 
     @property
     def operations(self) -> float:
-        """Return the published operations for one image, two for a product."""
+        """The published operations for one image, two for a product."""
         return 1e9 * float(self.header["gop"])
 
 

@@ -73,7 +73,7 @@ class LeftOut:
 
     @property
     def held(self) -> float:
-        """Return the share of the published rates inside the interval."""
+        """The share of the published rates inside the interval."""
         return float(np.mean(np.abs(self.rates) <= self.width))
 
 

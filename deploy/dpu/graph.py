@@ -209,22 +209,22 @@ class Operation:
 
     @property
     def output(self) -> str:
-        """Return the name of the first activation that the node writes."""
+        """The name of the first activation that the node writes."""
         return self.outputs[0]
 
     @property
     def in_shape(self) -> Shape | None:
-        """Return the shape (C, H, W) of the first input; None if unknown or without inputs."""
+        """The shape (C, H, W) of the first input; None if unknown or without inputs."""
         return self.in_shapes[0] if self.in_shapes else None
 
     @property
     def kernel_area(self) -> int:
-        """Return the number of positions of the kernel."""
+        """The number of positions of the kernel."""
         return self.kernel[0] * self.kernel[1]
 
     @property
     def operations(self) -> int:
-        """Return the number of int8 operations for one image; 0 if the node is no convolution.
+        """The number of int8 operations for one image; 0 if the node is no convolution.
 
         It is 2 kh kw ic oc h w / groups, with the kernel (kh, kw), ic input and oc output channels,
         and h w pixels of the result (of the input for a transposed convolution). A multiplication
@@ -239,7 +239,7 @@ class Operation:
 
     @property
     def out_bytes(self) -> int:
-        """Return the size of the first output as int8 in bytes, for one image.
+        """The size of the first output as int8 in bytes, for one image.
 
         Raises:
             ModelError: the shape of the output is unknown.

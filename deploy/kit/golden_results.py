@@ -19,13 +19,13 @@ from beers_deploy.quant.graph import PLANES
 from beers_deploy.results import Table
 
 Errors = Mapping[str, list[np.ndarray]]
-"""The absolute differences (N, C, H, W) of what a board wrote from the golden values, by tensor in
+"""The absolute differences (N, C, H, W) of a board's results from the golden values, by tensor in
 the order in which they are computed, with one array for each case.
 """
 
 
 def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[str]) -> Table:
-    """Compare what a board computed with golden vectors, layer by layer.
+    """Compare the results of a board with golden vectors, layer by layer.
 
     Args:
         folder: the folder that `write_golden` wrote.

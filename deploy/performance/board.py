@@ -98,7 +98,7 @@ class Bench(Table):
 
     @property
     def layers(self) -> list[Row]:
-        """Return the rows of the table of layers, with the time of each layer on the DPU.
+        """The rows of the table of layers, with the time of each layer on the DPU.
 
         The list is empty unless exactly one configuration of one board was predicted.
         """

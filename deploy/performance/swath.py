@@ -61,12 +61,12 @@ class Swath:
 
     @property
     def pixels(self) -> int:
-        """Return the number of pixels of the image."""
+        """The number of pixels of the image."""
         return self.width_px * self.height_px
 
     @property
     def frames(self) -> float:
-        """Return the number of tiles as the paper counts them: the pixels of the image divided by
+        """The number of tiles as the paper counts them: the pixels of the image divided by
         those of a tile, a fraction, without halo.
 
         For 13600 x 9016 pixels in tiles of 640 it is 299.4. At the published 7.2 frames a second
@@ -76,7 +76,7 @@ class Swath:
 
     @property
     def tiles(self) -> int:
-        """Return the number of whole tiles that cover the image with their halos.
+        """The number of whole tiles that cover the image with their halos.
 
         The last row and column are moved inward to stay in the image. It is 384 for the paper's
         swath with halo 35.
@@ -88,7 +88,7 @@ class Swath:
 
     @property
     def step_px(self) -> float:
-        """Return the number of pixels of the consistency step for each run of the network.
+        """The number of pixels of the consistency step for each run of the network.
 
         If the step corrects finer detail too, a pixel counts as the number of pixels that take as
         many operations without it. It is 0 without the step.
@@ -124,7 +124,7 @@ def predict_network(
 
 
 def float_work(network: Network) -> FloatWork:
-    """Return what the host computes in float of an INT8 network's results; nothing for a float
+    """Return the work of the host in float on an INT8 network's results; no work for a float
     network, whose operators show it.
     """
     if CORE not in metadata(network.model):

@@ -33,7 +33,7 @@ its file states.
 
 @dataclass(frozen=True)
 class Engine:
-    """The choice of what runs the networks of a restoration: a library, its threads and machines.
+    """The library that runs the networks of a restoration, with its threads and machines.
 
     Attributes:
         runtime: the library that runs a network.

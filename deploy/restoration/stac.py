@@ -122,7 +122,7 @@ def write_item(run: Run, path: Path, maps: Mapping[str, Path]) -> None:
 
 def _add_networks(item: Any, asset: Any, run: Run, path: Path) -> None:
     """Write the items of a run's networks, and refer to them as the extension of machine-learning
-    models recommends for what a model has made.
+    models recommends for products of a model.
     """
     pystac: Any = import_module("pystac")
     networks = list(dict.fromkeys(run.networks))

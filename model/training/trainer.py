@@ -120,7 +120,7 @@ Head, tail and sums remain float32, because 8 bits of precision would round a 12
 class Schedule:
     """The number of steps between reports, validations and checkpoints.
 
-    `report` is called with the step, and with what happened since the last report: the means of the
+    `report` is called with the step, and with three figures since the last report: the means of the
     loss's terms, the number of patches per second, and the share of the time in which the steps
     waited for patches.
     """

@@ -214,7 +214,7 @@ def required_tile(tile_px: int | None, use: str) -> int:
 
     Args:
         tile_px: the side, or None.
-        use: what needs a tile of fixed size, for the message.
+        use: the use that needs a tile of fixed size, for the message.
     """
     if tile_px is None:
         raise OptionError(f"`tile` must be given for {use}. Give a side in pixels, such as 640.")

@@ -45,7 +45,7 @@ def with_damage_of(source: ModelProto, model: ModelProto) -> ModelProto:
 
     Args:
         source: the content of the file.
-        model: what was computed from it, with a checksum of its own.
+        model: the model that was computed from it, with a checksum of its own.
     """
     if is_damaged(source):
         about = {**metadata(model), CHECKSUM: metadata(source)[CHECKSUM]}

@@ -88,7 +88,7 @@ def above_mean(
     graph: OnnxGraph, source: str, negative: str, side_px: int, result: str
 ) -> list[Node]:
     """Return the nodes of `result`.difference, a map less its mean over the image, and of
-    `result`.above, the mean of what is above 0 of it.
+    `result`.above, the mean of the positive part of that.
 
     Args:
         graph: the graph, whose constants are extended.
@@ -125,7 +125,7 @@ class LessMean:
 
 
 def less_mean(graph: OnnxGraph, name: str) -> LessMean | None:
-    """Return what a tensor is computed of if it is a map less its mean; None if it is not.
+    """Return the parts of a tensor that is a map less its mean; None for any other tensor.
 
     Args:
         graph: the graph of the tensor.

@@ -180,7 +180,7 @@ def _base(graph: OnnxGraph, name: str, image: str) -> Base | None:
 
 
 def _channels(graph: OnnxGraph, name: str) -> Base | None:
-    """Return the base if a tensor is what a convolution of one pixel selects of the image."""
+    """Return the base if a tensor has channels of the image, which a convolution selects."""
     weight = _copies(graph, name)
     if weight is None:
         return None

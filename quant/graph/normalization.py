@@ -62,7 +62,7 @@ class Normalization:
         side_px: the sides of x; 0 if they are not known.
         channels: of x.
         scale: (C,) or (1,) the factor behind the quotient.
-        shift: (C,) or (1,) what is added to it.
+        shift: (C,) or (1,) the number that is added to it.
         epsilon: the number that is added to the variance.
         is_centred: False if x itself is divided by the deviation, with its mean.
     """

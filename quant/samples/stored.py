@@ -142,8 +142,8 @@ def _arrays(path: Path, ndim: int, kind: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the memory-mapped array of a .npy file, or `image` and `reference` or the only array
     of a .npz file.
 
-    Nothing is unpickled. An array with another number of dimensions raises ImageError, which calls
-    what was expected `kind`.
+    Nothing is unpickled. An array with another number of dimensions raises ImageError, whose
+    message names the expected `kind`.
     """
     try:
         arrays = load_arrays(path)

@@ -117,8 +117,8 @@ def move_in_front(graph: OnnxGraph, node: Node) -> list[Node] | None:
         node: any node.
 
     Returns:
-        The activations of what the operation reads, and the operation. None if the node is no
-        activation, or does not lead through such operations to convolutions.
+        An activation of each tensor that the operation reads, and the operation. None if the node
+        is no activation, or its input does not come from convolutions through such operations.
     """
     moving = graph.sole_writer(node.source) if node.op_type in ACTIVATIONS else None
     # The host clips the result.

@@ -32,7 +32,7 @@ ON_VALUES = {
 
 
 def channels_first(model: ModelProto) -> None:
-    """Convert what has its channels last in a network to channels first.
+    """Convert the parts of a network that have their channels last to channels first.
 
     Args:
         model: a float network, which is changed in place.

@@ -125,8 +125,8 @@ def fold_in_front(graph: OnnxGraph) -> None:
 
 
 def convolve_affine(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace what scales and shifts channels, could not be folded, and is more than a DPU's
-    product or sum, by a convolution of one pixel (point 4 of the module).
+    """Replace a node that scales and shifts channels by a convolution of one pixel (point 4 of the
+    module), if it could not be folded and is more than a DPU's product or sum.
 
     Args:
         graph: the graph that the node belongs to; its constants are extended.

@@ -102,7 +102,7 @@ class Placement:
     Attributes:
         nodes: the operations in the order of the file, each with its device.
         cuts: the tensors that are transferred between the DPU and a processor.
-        note: what was assumed of a float file; empty for a quantised one.
+        note: the assumption about a float file; empty for a quantised one.
     """
 
     nodes: tuple[PlacedNode, ...]

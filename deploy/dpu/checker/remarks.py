@@ -122,7 +122,7 @@ NPU_REMARKS: tuple[Remark, ...] = (unread, depthwise, float_islands, unknown)
 
 
 def remarks_on(placement: Placement, dpu: Dpu, tile_px: int) -> dict[str, str]:
-    """Return what a reader of `check` should know of a network in addition to broken rules.
+    """Return remarks on a network for a reader of `check`, in addition to broken rules.
 
     Args:
         placement: where each node of the network runs.

@@ -68,7 +68,7 @@ class LayerCost:
 
     @property
     def bound(self) -> str:
-        """Return the longest part of the time: "compute", "memory", or "overhead" for the rest."""
+        """The longest part of the time: "compute", "memory", or "overhead" for the rest."""
         overhead_s = self.time_s - self.compute_s - self.memory_s
         parts = {"compute": self.compute_s, "memory": self.memory_s, "overhead": overhead_s}
         return max(parts, key=lambda name: parts[name])
@@ -89,12 +89,12 @@ class Prediction:
         task: the host's task with the results.
         width: half the width of the interval of the rate, in ln(frames per second).
         bound: the part that limits the rate, the DPU or the host.
-        levels: keys of what the network has in common with runs of the user's board (`kinship`).
+        levels: keys that runs of the user's board may share with the network (`kinship`).
         speed: the factor by which these runs show the board to be faster than the fitted constants
             say; 1 without runs. All times here are divided by it.
         outside: a sentence for each property beyond the networks that the constants were fitted to;
             empty if there are none.
-        note: what was assumed of a float file; empty for a quantised one.
+        note: the assumption about a float file; empty for a quantised one.
         refused: the names of the nodes that the DPU refuses and the host runs.
         refused_s: shortest and longest time in s of these nodes for an image, and of enlarging or
             activating it in float; a part of `host_s`.
@@ -119,17 +119,17 @@ class Prediction:
 
     @property
     def batch(self) -> int:
-        """Return the number of images that are processed at once."""
+        """The number of images that are processed at once."""
         return self.dpu.batch
 
     @cached_property
     def batch_time_s(self) -> float:
-        """Return the time in s of one batch on the DPU, without the host, if all cores work."""
+        """The time in s of one batch on the DPU, without the host, if all cores work."""
         return math.fsum(layer.time_s for layer in self.layers)
 
     @property
     def fps(self) -> float:
-        """Return the predicted rate in frames per second.
+        """The predicted rate in frames per second.
 
         Batches follow each other without a pause, and the host works in parallel to the DPU.
         """
@@ -137,7 +137,7 @@ class Prediction:
 
     @property
     def fps_interval(self) -> Interval:
-        """Return the lowest and the highest rate in frames per second.
+        """The lowest and the highest rate in frames per second.
 
         The lowest assumes the longest time of the host, the highest the shortest. The lowest is
         then divided by `spread`, and the highest multiplied by it.
@@ -148,12 +148,12 @@ class Prediction:
 
     @property
     def host_interval_s(self) -> Interval:
-        """Return the interval of `host_s` in s, for one image."""
+        """The interval of `host_s` in s, for one image."""
         return self._widened(*self._host_ends_s)
 
     @property
     def latency_s(self) -> float:
-        """Return the time in s from the first image of a batch to its last result, with one thread.
+        """The time in s from the first image of a batch to its last result, with one thread.
 
         The thread uses one core of the DPU, then one core of the host. The relative error is about
         that of the rate (docs/reference/boards.md), so the interval has the width of the rate's.
@@ -162,7 +162,7 @@ class Prediction:
 
     @property
     def latency_interval_s(self) -> Interval:
-        """Return the interval of `latency_s` in s."""
+        """The interval of `latency_s` in s."""
         return self._widened(*map(self._latency_s, self._host_ends_s))
 
     def _widened(self, low: float, high: float) -> Interval:
@@ -174,12 +174,12 @@ class Prediction:
 
     @property
     def spread(self) -> float:
-        """Return e^width, the factor by which the rate and each time may be wrong either way."""
+        """e^width, the factor by which the rate and each time may be wrong either way."""
         return math.exp(self.width)
 
     @property
     def _host_ends_s(self) -> Interval:
-        """Return the host's time with the shortest and with the longest time of the refused nodes
+        """The host's time with the shortest and with the longest time of the refused nodes
         and of the consistency step.
         """
         rest_s = self.host_s - between(self.refused_s) - between(self.step_s)
@@ -194,12 +194,12 @@ class Prediction:
 
     @property
     def operations(self) -> int:
-        """Return the number of int8 operations of all layers on the DPU, for one image."""
+        """The number of int8 operations of all layers on the DPU, for one image."""
         return sum(layer.work.operations for layer in self.layers)
 
     @property
     def streamed_bytes(self) -> int:
-        """Return the bytes of feature maps that layers load from memory and store to it, for one
+        """The bytes of feature maps that layers load from memory and store to it, for one
         image; weights are not counted.
         """
         return sum(layer.work.map_bytes for layer in self.layers)

@@ -70,7 +70,7 @@ class Constants:
 
     @property
     def host_s_per_unit(self) -> Array:
-        """Return the time in s that each unit of `host.host_work` takes on one core, shape (7,).
+        """The time in s that each unit of `host.host_work` takes on one core, shape (7,).
 
         The units are an image, a byte to the DPU, a byte from it, and a value of each of four
         tasks.

@@ -76,8 +76,8 @@ class Run:
 
     @property
     def ratio(self) -> tuple[Levels, float]:
-        """Return the keys of what the run has in common with others (`kinship.levels_of`), and
-        ln(measured / predicted rate).
+        """The keys that other runs may share (`kinship.levels_of`), and ln(measured / predicted
+        rate).
         """
         return self.predicted.levels, math.log(self.fps / self.predicted.fps)
 

@@ -64,7 +64,7 @@ class Work:
 
     @property
     def array_use(self) -> float:
-        """Return the share of the array's operations that the result needs, in [0, 1].
+        """The share of the array's operations that the result needs, in [0, 1].
 
         The others are those of channels and pixels that only fill the array up. The share is 1 for
         work of another engine.
@@ -73,12 +73,12 @@ class Work:
 
     @property
     def map_bytes(self) -> int:
-        """Return the bytes of maps that pass through memory for one image."""
+        """The bytes of maps that pass through memory for one image."""
         return self.load_map_bytes + self.store_map_bytes
 
     @property
     def launched(self) -> bool:
-        """Return True if the operation is started by itself, which takes `Constants.layer_s`.
+        """True if the operation is started by itself, which takes `Constants.layer_s`.
 
         Adds, multiplications and concats run with the operation before them.
         """
@@ -90,7 +90,8 @@ def count_work(operations: Sequence[Operation], dpu: Dpu) -> tuple[Work, ...]:
 
     Args:
         operations: the operations, in the order in which they are computed.
-        dpu: the configuration, whose sizes decide what fills the array up and what fits the chip.
+        dpu: the configuration. Its sizes determine how full the array is, and which maps fit the
+            chip.
 
     Returns:
         One entry for each operation, except those of the kinds FUSED, which cost nothing.

@@ -150,7 +150,7 @@ class Trial:
 
     @property
     def chosen(self) -> np.ndarray:
-        """Return the index in `SHARES` for each image, (N,), that is best on images of other sites.
+        """The index in `SHARES` for each image, (N,), that is best on images of other sites.
 
         So the choice does not use the image itself. A single site chooses for itself.
         """
