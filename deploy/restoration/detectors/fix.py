@@ -107,8 +107,8 @@ def require_neighbours(faults: FaultList, raster: Raster) -> None:
         reached = binary_dilation(valid, np.ones(2 * REACH_PX + 1))
         if stay := int(np.count_nonzero(~reached)):
             logger.warning(
-                "check the detectors: %s cannot be replaced, because no valid one is within %d px. "
-                "Mark these pixels as nodata",
+                "look at the detectors: %s cannot be replaced, because no valid one is within "
+                "%d px. Mark these pixels as nodata",
                 counted(stay, f"faulty {name}"),
                 REACH_PX,
             )

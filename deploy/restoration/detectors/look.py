@@ -252,7 +252,7 @@ def sentences(bands: Sequence[BandFaults], advise_fix: bool = True) -> list[str]
                 f"be: hot, dead or hit by a particle ({_some(places)}); restoration sharpens that"
                 f"{FIX + 'pixels' if advise_fix else ''}"
             )
-        messages += [f"check the detectors: {where}{text}" for text in words]
+        messages += [f"look at the detectors: {where}{text}" for text in words]
     return messages
 
 

@@ -188,7 +188,7 @@ def test_sentences_name_kind_place_and_remedy() -> None:
     pixels[:, ::2] *= 1.04
     clipped = np.rint(np.minimum(pixels, 4095)).astype(np.uint16)
     lines = sentences(look_at_detectors(source_of(clipped), 5000))
-    assert all("check the detectors: " in sentence for sentence in lines)
+    assert all("look at the detectors: " in sentence for sentence in lines)
     for words in (
         "1 dead column",
         "column 40",
@@ -244,7 +244,7 @@ def test_a_restoration_sees_the_replaced_pixels(image: Path, model: Path, tmp_pa
     run(clean, out, fix_detectors=str(listed))
     assert_array_equal(tifffile.imread(out), expected)
     shown = done(f"restore {image} --dry-run --network {model}")
-    assert "check the detectors: 1 dead column" in shown
+    assert "look at the detectors: 1 dead column" in shown
     assert "dead lines" in shown
 
 
