@@ -171,7 +171,7 @@ def layer_errors(
         image = core.host_part.finish(crop, nothing)
         offset = to_shares(image, ranges) if core.host_part.adds_image else 0.0
         for op, layer in zip(graph, layers, strict=True):
-            result = _in_int8(op, core, float_values)
+            result = _in_int8(core, op, float_values)
             expected = float_values[op.output]
             # Of two gains one is coarse and the other clipped, so they count together.
             if op.output == CORRECTION:
@@ -190,7 +190,7 @@ def layer_errors(
     return layers, together
 
 
-def _in_int8(op: Op, core: IntCore, exact: Mapping[str, np.ndarray]) -> np.ndarray:
+def _in_int8(core: IntCore, op: Op, exact: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return a layer's result when it alone is in int8."""
     if isinstance(op, Conv):
         return rounded_to(exact[op.output + IN_INT8], core.frac_bits[op.output])

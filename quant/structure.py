@@ -176,7 +176,7 @@ def _rounded(graph: OnnxGraph, core: IntCore | None) -> list[Rounded]:
     tensors = []
     for node in graph.nodes:
         name = node.result
-        scale = dict(stated(node, graph)).get(name)
+        scale = dict(stated(graph, node)).get(name)
         if scale is not None and scale.integer_type in BYTES and node.source not in graph.constants:
             tensors.append(
                 Rounded(name, scale, name in relus, counted if name == CORRECTION else slice(None))
@@ -242,7 +242,7 @@ def count_relus(model: ModelProto) -> Relus:
         nodes = [node for node in graph.nodes if alike.isdisjoint(node.outputs)]
         convolutions = [node for node in graph.nodes if "Conv" in node.op_type]
         convolved = set(chain.from_iterable(node.outputs for node in convolutions))
-        explicit = sum(_is_relu(node, graph, tensors) for node in nodes)
+        explicit = sum(_is_relu(graph, node, tensors) for node in nodes)
         folded = 0
         for node in graph.nodes:
             value = tensors.get(node.result)
@@ -253,12 +253,12 @@ def count_relus(model: ModelProto) -> Relus:
         return Relus(explicit, folded)
 
 
-def _is_relu(node: Node, graph: OnnxGraph, tensors: dict[str, Rounded]) -> bool:
+def _is_relu(graph: OnnxGraph, node: Node, tensors: dict[str, Rounded]) -> bool:
     """Return True if a node is a ReLU, a ReLU6, a maximum with zero or a table of a ReLU.
 
     Args:
+        graph: the graph that the node belongs to.
         node: any node.
-        graph: the graph that it belongs to.
         tensors: the tensors of 8 bits by name, whose zero is their zero point.
     """
     constants = [graph.constants[name] for name in node.inputs if name in graph.constants]

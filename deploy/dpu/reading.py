@@ -180,7 +180,7 @@ def _sized(graph: OnnxGraph, inputs: dict[str, Shape]) -> SizedGraph:
         if integers.is_notation(node):
             continue
         weight = integers.weight(node)
-        kind = "activation" if _is_activation(node, graph, integers) else kind_of(node, weight)
+        kind = "activation" if _is_activation(graph, node, integers) else kind_of(node, weight)
         sources = integers.activations(node)
         formats = integers.formats(node)
         shapes = tuple(map(shape_of.get, sources))
@@ -219,7 +219,7 @@ def _sized(graph: OnnxGraph, inputs: dict[str, Shape]) -> SizedGraph:
     return SizedGraph(tuple(operations), inputs, network_outputs, integers.present)
 
 
-def _is_activation(node: Node, graph: OnnxGraph, integers: Integers) -> bool:
+def _is_activation(graph: OnnxGraph, node: Node, integers: Integers) -> bool:
     """Return True for the activations of integer files and banks.
 
     These are max(q, zero point), which is the ReLU of integers, Clip from 0 to 6, which is ReLU6,

@@ -71,7 +71,7 @@ def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
         The kind; None if the node is not replaced, such as a Sigmoid that is a part of a SiLU.
     """
     attributes = node.attributes
-    resizing = Resizing.of(node, graph) if node.op_type == "Resize" else None
+    resizing = Resizing.of(graph, node) if node.op_type == "Resize" else None
     kinds = {
         Kind.attention: shrinking(graph, node),
         Kind.silu: silu_input(graph, node),

@@ -126,7 +126,7 @@ def _approximation(
     if kind is Kind.tanh:
         return _clipped_line(graph, node)
     if kind is Kind.bilinear:
-        factor = int(Resizing.of(node, graph).factors[2])
+        factor = int(Resizing.of(graph, node).factors[2])
         return enlarged_bilinearly(graph, node.source, factor, node)
     if normalization := Normalization.of(graph, node):
         return normalization.nodes(graph, inverses.get(node.result))
@@ -168,7 +168,7 @@ def _cubic_convolution(graph: OnnxGraph, node: Node) -> list[Node]:
     for reader in graph.readers[result]:
         if reader.result not in on_host:
             reader.inputs = tuple(convolved if name == result else name for name in reader.inputs)
-    factor = int(Resizing.of(node, graph).factors[2])
+    factor = int(Resizing.of(graph, node).factors[2])
     base = Base(factor=factor, mode="cubic")
     weight = base.kernel(graph.channels(image))
     mirrored = f"{result}.mirrored"

@@ -47,7 +47,7 @@ def shrinking(graph: OnnxGraph, node: Node) -> list[Node]:
         and pool.attributes.get("kernel_shape") == [7, 7]
         and pool.attributes.get("strides") == [3, 3]
         and not any([*writer.attributes.get("pads", []), *pool.attributes.get("pads", [])])
-        and Resizing.of(node, graph).mode == "linear"
+        and Resizing.of(graph, node).mode == "linear"
     )
     return [writer, *nodes] if is_attention else []
 

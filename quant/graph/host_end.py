@@ -161,7 +161,7 @@ def _base(graph: OnnxGraph, name: str, image: str) -> Base | None:
     if node is None or node.op_type not in ("Resize", "Upsample"):
         return _channels(graph, name)
     source = THE_IMAGE if node.inputs[0] == image else _channels(graph, node.inputs[0])
-    resizing = Resizing.of(node, graph)
+    resizing = Resizing.of(graph, node)
     if source is None or resizing.factors[:2] != (1, 1):
         return None
     factor = int(resizing.factors[2])
@@ -194,7 +194,7 @@ def _repeated(graph: OnnxGraph, name: str, shuffle: Node) -> Base | None:
     image's pixels.
     """
     weight = _copies(graph, name)
-    operation = READERS["DepthToSpace"](shuffle, graph)
+    operation = READERS["DepthToSpace"](graph, shuffle)
     assert isinstance(operation, Shuffle)  # noqa: S101 - that is what it reads
     if weight is None or len(weight) != weight.shape[1] * operation.block**2:
         return None

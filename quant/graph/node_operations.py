@@ -44,7 +44,7 @@ def require(condition: bool, node: Node, rule: str, remedy: str = REMEDY) -> Non
         raise unsupported(f"{node} {rule}.", remedy)
 
 
-def _read_conv(node: Node, graph: OnnxGraph) -> Op:
+def _read_conv(graph: OnnxGraph, node: Node) -> Op:
     """Read a convolution of one group or of one for each channel, or a transposed one."""
     weight = graph.value(node, 1)
     bias = graph.value(node, 2)
@@ -114,7 +114,7 @@ def _window(node: Node, kernel: Sequence[int] = ()) -> tuple[Pair, Window]:
     return kernel_and_window
 
 
-def _read_concat(node: Node, graph: OnnxGraph) -> Op:
+def _read_concat(graph: OnnxGraph, node: Node) -> Op:
     axis = node.attributes.get("axis")
     require(axis in (1, -3), node, f"must concatenate along the channels, got axis {axis}")
     computed = graph.constants.keys().isdisjoint(node.inputs)
@@ -122,13 +122,13 @@ def _read_concat(node: Node, graph: OnnxGraph) -> Op:
     return Concat(node.name, node.inputs, node.result)
 
 
-def _read_max_pool(node: Node, _: OnnxGraph) -> Op:
+def _read_max_pool(_: OnnxGraph, node: Node) -> Op:
     plain = len(node.outputs) == 1 and not node.attributes.get("ceil_mode", 0)
     require(plain, node, "must have one output and ceil_mode 0")
     return MaxPool(node.name, node.source, node.result, *_window(node))
 
 
-def _read_average_pool(node: Node, _: OnnxGraph) -> Op:
+def _read_average_pool(_: OnnxGraph, node: Node) -> Op:
     kernel, window = _window(node)
     zeros = bool(node.attributes.get("count_include_pad", 0)) or not any(window.pads)
     plain = zeros and not node.attributes.get("ceil_mode", 0)
@@ -136,8 +136,8 @@ def _read_average_pool(node: Node, _: OnnxGraph) -> Op:
     return AveragePool(node.name, node.source, node.result, kernel, window)
 
 
-def _read_resize(node: Node, graph: OnnxGraph) -> Op:
-    resizing = Resizing.of(node, graph)
+def _read_resize(graph: OnnxGraph, node: Node) -> Op:
+    resizing = Resizing.of(graph, node)
     is_uniform = resizing.factors[:2] == (1, 1) and resizing.factors[2] == resizing.factors[3]
     rule = "must enlarge rows and columns by one factor for images of all sizes"
     require(is_uniform, node, rule, PAD_STRIDES)
@@ -169,7 +169,7 @@ def _read_resize(node: Node, graph: OnnxGraph) -> Op:
     return Resize(node.name, node.source, node.result, factor, resizing.mode == "linear")
 
 
-def _read_shuffle(node: Node, _: OnnxGraph) -> Op:
+def _read_shuffle(_: OnnxGraph, node: Node) -> Op:
     """Read a pixel shuffle; Reshape and Transpose that make one are one already."""
     mode = node.attributes.get("mode", "DCR") if node.op_type not in MOVES else ""
     require(
@@ -184,13 +184,13 @@ def _read_shuffle(node: Node, _: OnnxGraph) -> Op:
     return Shuffle(name, node.source, node.result, block, up, ORDERS[mode])
 
 
-READERS: dict[str, Callable[[Node, OnnxGraph], Op]] = {
+READERS: dict[str, Callable[[OnnxGraph, Node], Op]] = {
     "AveragePool": _read_average_pool,
     "Concat": _read_concat,
     "Conv": _read_conv,
     "ConvTranspose": _read_conv,
     "DepthToSpace": _read_shuffle,
-    "GlobalAveragePool": lambda node, _: AveragePool(node.name, node.source, node.result, None),
+    "GlobalAveragePool": lambda _, node: AveragePool(node.name, node.source, node.result, None),
     "MaxPool": _read_max_pool,
     "Resize": _read_resize,
     "SpaceToDepth": _read_shuffle,
@@ -207,12 +207,12 @@ ACTIVATIONS = {
 }
 
 
-def read_activation(node: Node, graph: OnnxGraph) -> Activation:
+def read_activation(graph: OnnxGraph, node: Node) -> Activation:
     """Return the activation that a node computes.
 
     Args:
-        node: a node whose operator is one of `ACTIVATIONS`.
         graph: the graph that the node belongs to.
+        node: a node whose operator is one of `ACTIVATIONS`.
 
     Raises:
         ModelError: the node has a slope or limits that no DPU computes.

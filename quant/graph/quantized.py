@@ -59,15 +59,15 @@ class Scale:
         return 1 - exponent if fraction == 0.5 else None
 
 
-def stated(node: Node, graph: OnnxGraph) -> Iterator[tuple[str, Scale]]:
+def stated(graph: OnnxGraph, node: Node) -> Iterator[tuple[str, Scale]]:
     """Yield the tensors whose number format a node states, each with that format.
 
     A QuantizeLinear, for example, states that of its result. Constants such as weights are
     included.
 
     Args:
-        node: a node of the file.
         graph: the graph that the node belongs to, which knows the constants.
+        node: a node of the file.
     """
     places = FORMATS.get(node.op_type, {})
     if node.op_type == "QLinearConcat":
@@ -124,7 +124,7 @@ class Integers:
         for node in graph.nodes:
             # The format of a constant is that of its reader, because two nodes may read the same
             # bytes at two scales.
-            for name, scale in stated(node, graph):
+            for name, scale in stated(graph, node):
                 if name not in self._constants:
                     self._give(self.resolve(name), scale)
                 elif node.op_type == "DequantizeLinear":
@@ -218,7 +218,7 @@ class Integers:
             tensors["output"] = result if result in self._int8 else self._becomes[result]
             for role, name in tensors.items():
                 formats[role] = self._formats.get(self.resolve(name), ())
-        stated_scales = dict(stated(node, self._graph))
+        stated_scales = dict(stated(self._graph, node))
         for role, name in self._numbers(node).items():
             stored = self._formats.get(name, ())
             formats[role] = (stated_scales[name],) if name in stated_scales else stored

@@ -209,7 +209,7 @@ class _Reader:
                 self._read(node)
             except AdaptableError as error:
                 self.adaptable = self.adaptable or error
-                self.ops.append(_stand_in(node, self.source))
+                self.ops.append(_stand_in(self.source, node))
         if not self.ops or self.ops[-1].output != result:
             raise unsupported("No operation writes the network's output.")
         graph = named_apart(self.ops, {self.image: IMAGE, result: CORRECTION})
@@ -240,10 +240,10 @@ class _Reader:
             )
         for node in self.source.nodes:
             if node.op_type == "Pad" or REMEDIES.get(node.op_type) in (NORMALISES, STATISTICS):
-                raise _refused(node, self.source)
+                raise _refused(self.source, node)
             if node.op_type == "Resize" and node.result not in self.end.replaced:
                 with suppress(AdaptableError):
-                    READERS[node.op_type](node, self.source)
+                    READERS[node.op_type](self.source, node)
 
     def _read(self, node: Node) -> None:
         if node.op_type in ACTIVATIONS:
@@ -251,9 +251,9 @@ class _Reader:
         elif node.op_type in ("Add", "Div", "Mul", "Sub"):
             self._arithmetic(node)
         elif node.op_type in READERS:
-            self.ops.append(READERS[node.op_type](node, self.source))
+            self.ops.append(READERS[node.op_type](self.source, node))
         else:
-            raise _refused(node, self.source)
+            raise _refused(self.source, node)
 
     def _arithmetic(self, node: Node) -> None:
         """Append a sum, difference or product of two tensors, or of one with constants."""
@@ -292,7 +292,7 @@ class _Reader:
 
     def _activation(self, node: Node) -> None:
         """Fuse an activation into the operation before it, or append it as a separate operation."""
-        activation = read_activation(node, self.source)
+        activation = read_activation(self.source, node)
         source = node.source
         (output,) = node.outputs
         written = [op.output for op in self.ops]
@@ -319,15 +319,15 @@ class _Reader:
             self.ops.append(Pointwise(node.name, source, output, activation))
 
 
-def _stand_in(node: Node, graph: OnnxGraph) -> Op:
+def _stand_in(graph: OnnxGraph, node: Node) -> Op:
     """Return an operation in place of a node that can be adapted, so that the rest is read."""
     if node.op_type == "Resize":
-        factor = int(Resizing.of(node, graph).factors[2])
+        factor = int(Resizing.of(graph, node).factors[2])
         return Resize(node.name, node.source, node.result, factor, True)
     return Pointwise(node.name, node.source, node.result, Activation.hard_sigmoid)
 
 
-def _refused(node: Node, graph: OnnxGraph) -> ModelError:
+def _refused(graph: OnnxGraph, node: Node) -> ModelError:
     """Return the error of an operator that no DPU computes."""
     remedy = REMEDIES.get(node.op_type, OTHER_REMEDY)
     is_mean = node.op_type == "ReduceMean" and graph.numbers(node, 1, "axes") == [1]

@@ -48,12 +48,12 @@ class Resizing:
     rounding: str
 
     @classmethod
-    def of(cls, node: Node, graph: OnnxGraph) -> "Resizing":
+    def of(cls, graph: OnnxGraph, node: Node) -> "Resizing":
         """Read what a Resize or Upsample node states in its attributes and inputs.
 
         Args:
-            node: the node.
             graph: the graph that the node belongs to, which knows constant inputs.
+            node: the node.
         """
         # Before opset 11 the factors are the second input, and places start at the corner.
         old = node.op_type == "Upsample" or len(node.inputs) == 2
@@ -128,7 +128,7 @@ def enlarges_image(graph: OnnxGraph, node: Node) -> bool:
     """
     if node.op_type != "Resize":
         return False
-    resizing = Resizing.of(node, graph)
+    resizing = Resizing.of(graph, node)
     attribute = node.attributes.get
     is_plain = attribute("cubic_coeff_a", CUBIC) == CUBIC and not attribute("exclude_outside", 0)
     is_cubic = resizing.mode == "cubic" and resizing.is_half_pixel and is_plain

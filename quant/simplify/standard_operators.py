@@ -324,7 +324,7 @@ def shrink_by_convolution(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """
     if node.op_type != "Resize" or node.attributes.get("antialias", 0):
         return None
-    resizing = Resizing.of(node, graph)
+    resizing = Resizing.of(graph, node)
     channels = graph.channels(node.source)
     *_, factor, other_factor = resizing.factors or (0.0, 0.0)
     is_known = resizing.where in PLACES and resizing.mode in ("linear", "nearest")

@@ -240,7 +240,7 @@ def _resize(at: AxisNode) -> AxisMap:
     Linear and cubic interpolation are accepted only if all weights are exact floats. Raises
     ModelError for anything else.
     """
-    resizing = Resizing.of(at.node, at.graph)
+    resizing = Resizing.of(at.graph, at.node)
     at.require(bool(resizing.factors), "resizes to a fixed size")
     growth = Fraction(resizing.factors[2 + at.axis])
     by_whole_factor = (
