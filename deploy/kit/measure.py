@@ -74,12 +74,7 @@ def arguments() -> argparse.Namespace:
     add("--tile", type=count, help=sides)
     add("--batch", type=count, default=1, help="tiles in one call")
     add("--frames", type=count, default=300, help="tiles to time, after a warm-up")
-    add(
-        "--threads",
-        type=count,
-        default=1,
-        help="calls in flight; at most one for each batch handler",
-    )
+    add("--threads", type=count, default=1, help="calls in flight, up to one per batch handler")
     power = "file of the power in microwatts, such as hwmon's power1_input; repeat it to add more"
     add("--power-file", type=Path, action="append", default=[], help=power)
     add("--no-compare", action="store_true", help="skip the comparison with the CPU provider")

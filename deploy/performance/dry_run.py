@@ -22,7 +22,7 @@ from beers_deploy.profiles.errors import BeersError, ImageError
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.restoration.detectors.fault_list import FOUND
-from beers_deploy.restoration.detectors.look import warn_of_detectors
+from beers_deploy.restoration.detectors.strips import warn_of_detectors
 from beers_deploy.restoration.memory import check_memory, rows_bytes
 from beers_deploy.restoration.plan import Plan, plan_for
 from beers_deploy.restoration.prepare import NetworkPipeline

@@ -24,7 +24,7 @@ from beers_deploy.profiles.figures import Figure, measured, unavailable
 from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.cluster import Cluster
 from beers_deploy.restoration.detectors.fault_list import FOUND
-from beers_deploy.restoration.detectors.look import warn_of_detectors
+from beers_deploy.restoration.detectors.strips import warn_of_detectors
 from beers_deploy.restoration.memory import check_memory, rows_bytes
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Plan, Span, TilePlace, Tiles, plan_for

@@ -48,9 +48,8 @@ from beers_deploy.results import Input, Table
 logger = logging.getLogger(__name__)
 
 CHECKED = (
-    "the comparison of the image's own noise and edges with its sensor, and the look for faults "
-    "of detectors: "
-    "no part of time and throughput"
+    "the comparison of the image's own noise and edges with its sensor, and the search for faults "
+    "of detectors: no part of time and throughput"
 )
 SELF_CHECKED = "the self-check of all blocks: no part of time and throughput"
 ALPHA = (

@@ -24,7 +24,7 @@ from beers_deploy.restoration.detectors.fault_list import (
     FaultList,
     read_list,
 )
-from beers_deploy.restoration.detectors.look import as_floats, look_at_detectors, value_steps
+from beers_deploy.restoration.detectors.strips import as_floats, faults_in_strips, value_steps
 
 logger = logging.getLogger(__name__)
 
@@ -118,7 +118,7 @@ def find_faults(source: Source, name: str) -> FaultList:
     """Detect the faulty pixels, columns and rows of an image.
 
     Pixels, and rows that are dead (constant where their neighbours vary), are searched in the whole
-    image. Columns, and rows with a wrong gain, are detected in the strips that `look_at_detectors`
+    image. Columns, and rows with a wrong gain, are detected in the strips that `faults_in_strips`
     reads.
 
     Args:
@@ -133,7 +133,7 @@ def find_faults(source: Source, name: str) -> FaultList:
     """
     raster = source.raster
     lines = set[Fault]()
-    for band, band_faults in enumerate(look_at_detectors(source)):
+    for band, band_faults in enumerate(faults_in_strips(source)):
         number = band_number(band, raster)
         lines |= {Fault(column, -1, number) for column in _replaced(band_faults.columns)}
         lines |= {Fault(-1, row, number) for row in _replaced(band_faults.rows)}

@@ -22,7 +22,7 @@ from beers_deploy.restoration.detectors.fix import (
     find_faults,
     require_neighbours,
 )
-from beers_deploy.restoration.detectors.look import LOOKED_PX, look_at_detectors, sentences
+from beers_deploy.restoration.detectors.strips import CHECKED_PX, faults_in_strips, sentences
 from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import done
 from tests.deploy.restoration.runs import source_of, stopped_after
@@ -187,7 +187,7 @@ def test_sentences_name_kind_place_and_remedy() -> None:
     pixels = faulty().astype(np.float64)
     pixels[:, ::2] *= 1.04
     clipped = np.rint(np.minimum(pixels, 4095)).astype(np.uint16)
-    lines = sentences(look_at_detectors(source_of(clipped), 5000))
+    lines = sentences(faults_in_strips(source_of(clipped), 5000))
     assert all("look at the detectors: " in sentence for sentence in lines)
     for words in (
         "1 dead column",
@@ -199,10 +199,10 @@ def test_sentences_name_kind_place_and_remedy() -> None:
     ):
         assert any(words in sentence for sentence in lines), words
     remedy = "; `fix_detectors` found replaces such "
-    without = sentences(look_at_detectors(source_of(clipped), 5000), advise_fix=False)
+    without = sentences(faults_in_strips(source_of(clipped), 5000), advise_fix=False)
     assert without == [sentence.split(remedy)[0] for sentence in lines]
     assert without != lines
-    assert not sentences(look_at_detectors(source_of(ground(HEIGHT, WIDTH)), 4095))
+    assert not sentences(faults_in_strips(source_of(ground(HEIGHT, WIDTH)), 4095))
 
 
 def test_few_rows_of_a_large_image_are_read() -> None:
@@ -214,8 +214,8 @@ def test_few_rows_of_a_large_image_are_read() -> None:
             return np.broadcast_to(ground(1, 1, 5000), (1, stop - start, 5000))
 
     source = Counting(np.empty((1, 0, 0), np.uint16), Raster(1, 10**6, 5000, np.dtype(np.uint16)))
-    look_at_detectors(source)
-    assert source.rows * 5000 < 1.2 * LOOKED_PX
+    faults_in_strips(source)
+    assert source.rows * 5000 < 1.2 * CHECKED_PX
 
 
 @pytest.fixture

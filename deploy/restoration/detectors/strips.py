@@ -4,7 +4,7 @@ single pixels.
 Restoration sharpens isolated deviations: a column whose gain is off by 1 % comes out off by almost
 2 %. Therefore `restore` warns of it, and `restore --dry-run` shows the faults found. The strips
 span the whole width and are spread evenly from top to bottom. In a large image they cover
-`LOOKED_PX` pixels of all bands together.
+`CHECKED_PX` pixels of all bands together.
 """
 
 import logging
@@ -32,7 +32,7 @@ from beers_deploy.restoration.detectors.fault_list import FOUND
 
 logger = logging.getLogger(__name__)
 
-LOOKED_PX = 1 << 23
+CHECKED_PX = 1 << 23
 """The number of pixels, over all bands, that are checked. This takes one to two seconds on one core
 (measured).
 """
@@ -61,17 +61,17 @@ class BandFaults:
             number in the image.
         patterns: the fixed patterns that repeat after two pixels, such as a checkerboard.
         pixels: row and column in the image, (n, 2), of single wrong pixels in the strips.
-        looked_px: the number of pixels in the strips that are not missing.
+        checked_px: the number of pixels in the strips that are not missing.
     """
 
     columns: Stripes
     rows: Stripes
     patterns: tuple[Pattern, ...]
     pixels: np.ndarray
-    looked_px: int
+    checked_px: int
 
 
-def look_at_detectors(source: Source, full_scale: float = np.inf) -> tuple[BandFaults, ...]:
+def faults_in_strips(source: Source, full_scale: float = np.inf) -> tuple[BandFaults, ...]:
     """Detect faults of detectors in strips of an image that are spread from top to bottom.
 
     Args:
@@ -84,8 +84,8 @@ def look_at_detectors(source: Source, full_scale: float = np.inf) -> tuple[BandF
     """
     raster = source.raster
     steps = value_steps(source)
-    strips: list[list[StripLook]] = [[] for _ in steps]
-    rows_px = max(LOOKED_PX // (raster.width_px * raster.bands), LEAST_ROWS_PX)
+    strips: list[list[StripMeasures]] = [[] for _ in steps]
+    rows_px = max(CHECKED_PX // (raster.width_px * raster.bands), LEAST_ROWS_PX)
     rows_px = min(raster.height_px, rows_px)
     side_px = min(STRIP_PX, max(LEAST_STRIP_PX, rows_px // BLOCKS), raster.height_px)
     for place in np.linspace(0, raster.height_px - side_px, max(rows_px // side_px, 1)):
@@ -132,7 +132,7 @@ def value_steps(source: Source) -> list[float]:
     return [float(max(int(np.gcd.reduce(band.astype(np.int64), axis=None)), 1)) for band in rows]
 
 
-StripLook = tuple[Blocks, Blocks, range, list[tuple[np.ndarray, np.ndarray]], np.ndarray, int]
+StripMeasures = tuple[Blocks, Blocks, range, list[tuple[np.ndarray, np.ndarray]], np.ndarray, int]
 """The measurements in one strip of a band: columns, rows, the numbers of the rows in the image,
 patterns of two pixels, places of wrong pixels, and the number of known pixels.
 """
@@ -140,7 +140,7 @@ patterns of two pixels, places of wrong pixels, and the number of known pixels.
 
 def _measured(
     top: int, within: slice, pixels: np.ndarray, step: float, full_scale: float
-) -> StripLook:
+) -> StripMeasures:
     """Measure a strip of a band.
 
     Args:
@@ -177,16 +177,16 @@ def _measured(
     )
 
 
-def _judged(strips: Sequence[StripLook]) -> BandFaults:
+def _judged(strips: Sequence[StripMeasures]) -> BandFaults:
     """Evaluate all strips of a band together, and return the faults of the band."""
-    columns, rows, numbers, phases, pixels, looked_px = zip(*strips, strict=True)
+    columns, rows, numbers, phases, pixels, checked_px = zip(*strips, strict=True)
     row_stripes = judge_lines(join_blocks(rows, axis=1), LEAST)
     return BandFaults(
         columns=judge_lines(join_blocks(columns), LEAST),
         rows=row_stripes.renumbered(list(chain.from_iterable(numbers))),
         patterns=judge_phases(list(chain.from_iterable(phases)), LEAST),
         pixels=np.concatenate(pixels),
-        looked_px=sum(looked_px),
+        checked_px=sum(checked_px),
     )
 
 
@@ -214,7 +214,7 @@ def warn_of_detectors(
     Returns:
         The figures of the faults by name, for a row of results.
     """
-    bands = look_at_detectors(source, full_scale)
+    bands = faults_in_strips(source, full_scale)
     for sentence in sentences(bands, advise_fix):
         logger.warning(sentence)
     return figures(bands)
@@ -248,7 +248,7 @@ def sentences(bands: Sequence[BandFaults], advise_fix: bool = True) -> list[str]
         if len(band.pixels):
             places = [f"column {column}, row {row}" for row, column in band.pixels.tolist()]
             words.append(
-                f"{counted(len(places), 'pixel')} of {band.looked_px}, isolated as no light can "
+                f"{counted(len(places), 'pixel')} of {band.checked_px}, isolated as no light can "
                 f"be: hot, dead or hit by a particle ({_some(places)}); restoration sharpens that"
                 f"{FIX + 'pixels' if advise_fix else ''}"
             )
@@ -292,7 +292,7 @@ def figures(bands: Sequence[BandFaults]) -> Mapping[str, Figure]:
     result = dict[str, Figure]()
     for number, band in enumerate(bands, 1):
         where = f"band {number}: " if len(bands) > 1 else ""
-        how = f"{band.looked_px} pixels in strips of the image"
+        how = f"{band.checked_px} pixels in strips of the image"
         rms = f"rms over the level, without noise, {how}"
         pattern = max((pattern.difference for pattern in band.patterns), default=math.nan)
         off = len(band.columns.off) + len(band.rows.off)
