@@ -201,5 +201,5 @@ def test_a_size_and_zeros_around_maps_are_needed_for_statistics_of_the_image() -
         read_network(network("instance", px=None))
     mirrored = 'p = Pad <mode = "reflect"> (n, border)\nc = Conv (p, last)'
     model = network("instance", last=mirrored)
-    with pytest.raises(ModelError, match="Pad by zeros, and train it again"):
+    with pytest.raises(ModelError, match="Pad by zeros, and train the network again"):
         adapt(model, SAMPLES, HELD_OUT)
