@@ -7,7 +7,7 @@ from typing import Any
 from beers_deploy.model.raster.images import site_of
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.reference import reference_beside
+from beers_deploy.profiles.reference import reference_for
 from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.sensor_numbers import same_instrument
 from beers_deploy.profiles.toml import read_json
@@ -74,7 +74,7 @@ def profiles_for(
     """
     if recipe is None:
         degraded = Sensor.load(sensor or SENSOR)
-        return degraded, reference_beside(degraded, reference)
+        return degraded, reference_for(degraded, reference)
     if sensor:
         _require_made_by("sensor", Sensor.load(sensor), recipe.degraded)
     if reference:

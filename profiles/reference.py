@@ -20,7 +20,7 @@ def describe_units(profile: Sensor) -> str:
     )
 
 
-def reference_beside(degraded: Sensor, named: Sensor | str | os.PathLike[str] | None) -> Sensor:
+def reference_for(degraded: Sensor, named: Sensor | str | os.PathLike[str] | None) -> Sensor:
     """Load the reference, the better sensor that a restoration aims at, and convert it to the
     digital numbers of the degraded sensor.
 

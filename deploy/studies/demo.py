@@ -166,7 +166,7 @@ def bench_tables(model: Network, dn: np.ndarray, sensors: tuple[Sensor, Sensor])
     boards = tables.sweep_rows(model, swath, dpus, [TILE_PX])
     within = tables.within_words(boards, dpus, WITHIN_S)
     words = f"The same INT8 file on each board's default configuration. Of these, {within}."
-    title = "A swath of {} x {}, beside the paper's figures".format(*SWATH_PX)
+    title = "A swath of {} x {}, next to the paper's figures".format(*SWATH_PX)
     return [
         Section(f"Time and power for this image, {dn.shape[1]} x {dn.shape[0]}", rows[0]),
         Section(

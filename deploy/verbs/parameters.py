@@ -61,11 +61,11 @@ class Holds:
 
 
 @dataclass(frozen=True)
-class Beside:
+class NextTo:
     """Marks an output file next to which a second one of the same stem is written.
 
     Attributes:
-        suffix: of the second file.
+        suffix: the suffix of the second file.
         when: the name of the parameter that asks for it.
     """
 

@@ -191,7 +191,7 @@ def _recipe(
 ) -> "DatasetRecipe":
     """Return the recipe of a data set, which determines its pixels."""
     from beers_deploy.model.dataset import DatasetRecipe
-    from beers_deploy.profiles.reference import reference_beside
+    from beers_deploy.profiles.reference import reference_for
 
     scene_ratio = oversampling or degraded.oversampling.low
     # The scene is resampled first where its ratio is no integer.
@@ -205,7 +205,7 @@ def _recipe(
     return DatasetRecipe(
         tuple(scenes),
         degraded,
-        reference_beside(degraded, reference),
+        reference_for(degraded, reference),
         ratio,
         patch_px,
         radiance_scale,

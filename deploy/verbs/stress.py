@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.shipped import DEFAULT_TARGET
 from beers_deploy.verbs.parameters import (
-    Beside,
     InputPath,
     Interval,
     Names,
     NetworkLike,
+    NextTo,
     OutputFile,
     Progress,
     Seed,
@@ -42,7 +42,7 @@ def stress(
     images: InputPath | None = None,
     target: TargetLike = DEFAULT_TARGET,
     seed: Seed = 0,
-    out: Annotated[OutputFile, Beside(CURVES, when="bit_flips")] | None = None,
+    out: Annotated[OutputFile, NextTo(CURVES, when="bit_flips")] | None = None,
     progress: Progress = None,
 ) -> "Table":
     """Run hard cases through a network in float32, in INT8, in integers alone and in tiles.

@@ -95,7 +95,7 @@ def tradeoff(
     """
     from beers_deploy.dpu.board import boards_of
     from beers_deploy.performance.swath import parse_size
-    from beers_deploy.profiles.reference import reference_beside
+    from beers_deploy.profiles.reference import reference_for
     from beers_deploy.profiles.sensor import Sensor
     from beers_deploy.studies.tradeoff.advice import parse_constraints
 
@@ -111,7 +111,7 @@ def tradeoff(
     study = Study(
         networks=[_loaded(each, degraded) for each in networks],
         boards=boards_of(target),
-        sensors=(degraded, reference_beside(degraded, reference)),
+        sensors=(degraded, reference_for(degraded, reference)),
         scenes=path_or_none(images),
         lpips=path_or_none(lpips),
         calibration=path_or_none(calibration),

@@ -16,7 +16,7 @@ from typing import Any, Literal, ParamSpec, TypeVar, cast, get_args, get_origin
 from annotated_types import Interval
 
 from beers_deploy.profiles.errors import BeersError, OptionError, missing_extra, printable
-from beers_deploy.verbs.parameters import Beside, Holds, InputPath, Labelled, Wider, Written
+from beers_deploy.verbs.parameters import Holds, InputPath, Labelled, NextTo, Wider, Written
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -177,9 +177,9 @@ def paths_of(function: Callable[..., Any], arguments: Mapping[str, Any]) -> Path
         elif is_path:
             holds = marker(parameters[name], Holds)
             files = [Path(value)] if holds is None else [Path(value) / f for f in holds.files]
-            beside = marker(parameters[name], Beside)
-            if beside is not None and arguments.get(beside.when):
-                files.append(Path(value).with_suffix(beside.suffix))
+            second = marker(parameters[name], NextTo)
+            if second is not None and arguments.get(second.when):
+                files.append(Path(value).with_suffix(second.suffix))
             paths.outputs.extend(files)
             paths.verdicts.extend(files if written.verdict else [])
             paths.folders.extend([] if holds is None else [Path(value) / f for f in holds.folders])

@@ -52,12 +52,12 @@ def network_sha256(path: Path) -> str:
         # It is no network, which the reader of the file reports.
         return digest
     apart = [tensor for tensor in model.graph.initializer if tensor.external_data]
-    beside = sorted(
-        {_beside(tensor, _entries(tensor).get("location", ""), path) for tensor in apart}
+    files = sorted(
+        {_weights_file(tensor, _entries(tensor).get("location", ""), path) for tensor in apart}
     )
-    if not beside:
+    if not files:
         return digest
-    digests = "".join([digest, *map(sha256, beside)])
+    digests = "".join([digest, *map(sha256, files)])
     return hashlib.sha256(digests.encode()).hexdigest()
 
 
@@ -100,17 +100,17 @@ def _content(tensor: TensorProto, path: Path, limit_bytes: int) -> bytes:
         int(text) if text.isascii() and text.isdigit() and len(text) < 19 else None
         for text in texts
     )
-    beside = _beside(tensor, entries.get("location", ""), path)
-    if start is None or length != size or start + size > beside.stat().st_size:
+    file = _weights_file(tensor, entries.get("location", ""), path)
+    if start is None or length != size or start + size > file.stat().st_size:
         raise _refused(
-            tensor, path, f"{beside.name!r} does not hold the {size} bytes of these weights"
+            tensor, path, f"{file.name!r} does not hold the {size} bytes of these weights"
         )
-    with beside.open("rb") as stream:
+    with file.open("rb") as stream:
         stream.seek(start)
         return stream.read(size)
 
 
-def _beside(tensor: TensorProto, location: str, path: Path) -> Path:
+def _weights_file(tensor: TensorProto, location: str, path: Path) -> Path:
     """Return the regular file of the weights, in the model's folder or below and reached by no
     link.
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from beers_deploy.model.simulator.mtf import mtf
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles.constant import Constant
-from beers_deploy.profiles.reference import reference_beside
+from beers_deploy.profiles.reference import reference_for
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.evaluation.methods import method_named
 from beers_deploy.studies.evaluation.pairs import simulate_pairs
@@ -96,11 +96,11 @@ def test_a_named_reference_of_other_units_is_converted_and_logged(
 ) -> None:
     caplog.set_level(logging.INFO, "beers_deploy")
     degraded = with_units(DEGRADED, 40, 14, offset_dn=5)
-    assert reference_beside(degraded, None).units == (40, 14, 5)
+    assert reference_for(degraded, None).units == (40, 14, 5)
     assert caplog.messages == []
-    assert reference_beside(degraded, "pleiades-reference").units == (40, 14, 5)
+    assert reference_for(degraded, "pleiades-reference").units == (40, 14, 5)
     (sentence,) = caplog.messages
     assert "pleiades-reference (10.2375 DN per W/m2/sr/um, 12 bits)" in sentence
     assert "40 DN per W/m2/sr/um, 14 bits, 5 DN of offset" in sentence
-    reference_beside(DEGRADED, "pleiades-reference")
+    reference_for(DEGRADED, "pleiades-reference")
     assert len(caplog.messages) == 1

@@ -353,11 +353,11 @@ def as_stored(raster: Raster, restored: np.ndarray, full_scale: float) -> np.nda
     # A restored pixel lies between 0 and full scale, so another nodata value is never hit.
     if nodata is not None and 0 <= nodata <= full_scale:
         if raster.out_dtype.kind != "f":
-            beside = nodata + 1 if nodata + 1 <= full_scale else nodata - 1
+            adjacent = nodata + 1 if nodata + 1 <= full_scale else nodata - 1
         else:
             towards = full_scale if nodata < full_scale else 0
-            beside = float(np.nextafter(np.float32(nodata), np.float32(towards)))
-        result[result == result.dtype.type(nodata)] = beside
+            adjacent = float(np.nextafter(np.float32(nodata), np.float32(towards)))
+        result[result == result.dtype.type(nodata)] = adjacent
     return result
 
 

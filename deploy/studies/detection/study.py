@@ -19,7 +19,7 @@ from beers_deploy.model.simulator.acquire import acquire_padded
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import read_scene
 from beers_deploy.profiles.instrument import Instrument
-from beers_deploy.profiles.reference import reference_beside
+from beers_deploy.profiles.reference import reference_for
 from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.studies.detection.average_precision import (
     Figures,
@@ -197,7 +197,7 @@ def run_study(
     cases: list[tuple[SensorPair, dict[str, Method | None]]] = []
     # A method that does not exist is refused before anything is detected.
     for profile in sensors:
-        pair = SensorPair(profile, reference_beside(profile, reference))
+        pair = SensorPair(profile, reference_for(profile, reference))
         named = {name: method_named(name, pair.degraded, pair.reference) for name in methods}
         cases.append((pair, {REFERENCE: None, **named}))
     names = detector.names

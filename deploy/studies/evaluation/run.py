@@ -320,7 +320,7 @@ def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -
 
 MEAN_CAPTION = (
     "Intervals: 95 % bootstrap over sites for image figures, none below five sites; 90 % for the "
-    "MTF. What a method knows of the sensor stands beside it: one that knows it has an advantage "
+    "MTF. Each row states what its method knows of the sensor: one that knows it has an advantage "
     "that it may not have in orbit. Inner PSNR leaves out a border on every side. The bias of the "
     "mean is the mean of the restored inner pixels over that of the reference (without noise, "
     "where there is one) minus 1; the largest bias is that of one image."
