@@ -54,14 +54,14 @@ def takes_others(graph: OnnxGraph, node: Node) -> bool:
 
 
 def rearranged(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Return the operator that does what a node and those in front of it do together.
+    """Return one operator that replaces a node and those in front of it.
 
     Args:
         graph: the graph that the node belongs to; its constants are extended.
         node: a Transpose, a Reshape, or another operator that moves no value.
 
     Returns:
-        The operator; None if there is none for them.
+        The operator; None if there is no such operator.
     """
     source, chain = _chain(graph, node)
     before = graph.shapes.get(source, ())
