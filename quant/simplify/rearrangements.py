@@ -9,7 +9,8 @@ a map of numbered values:
    pixels, it is a convolution of r x r pixels and stride r that selects them. A pixel unshuffle of
    one channel is a SpaceToDepth. ONNX orders several channels in another way, and the host
    unshuffles an image of several channels.
-2. If each pixel becomes a block, it is a nearest Resize.
+2. If each pixel becomes a block, it is a nearest Resize, and if the channels become a block, a
+   DepthToSpace. `quant.graph.pixel_shuffle` reads one whose sizes are constants.
 3. If each value stays in its place, nothing is needed.
 
 All of it is exact.
@@ -24,8 +25,8 @@ from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 RESHAPING = {"Flatten", "Reshape", "Squeeze", "Unsqueeze"}
 """Operators that move no value."""
 MOVING = RESHAPING | {"Expand", "Gather", "GatherND", "Tile", "Transpose"}
-PIXEL_SHUFFLES = [0, 1, 4, 2, 5, 3], [0, 3, 4, 1, 5, 2]
-"""The transpositions of enlarging pixel shuffles, which stay."""
+PIXEL_SHUFFLES = {"CRD": [0, 1, 4, 2, 5, 3], "DCR": [0, 3, 4, 1, 5, 2]}
+"""The transposition of each mode of DepthToSpace."""
 OF_BLOCKS = {
     "mode": "nearest",
     "coordinate_transformation_mode": "asymmetric",
@@ -39,7 +40,13 @@ MOST_VALUES = 1 << 24
 def is_rearrangement(graph: OnnxGraph, node: Node) -> bool:
     """Return True if a node may belong to a chain that moves values, behind the image."""
     perm = node.attributes.get("perm", ())
-    is_one = len(perm) > 4 and perm not in PIXEL_SHUFFLES
+    before = graph.writers.get(node.source)
+    is_read_as_shuffle = (
+        perm in PIXEL_SHUFFLES.values()
+        and before is not None
+        and graph.value(before, 1) is not None
+    )
+    is_one = len(perm) > 4 and not is_read_as_shuffle
     return (
         node.op_type in ("GatherND", "Tile")
         or takes_others(graph, node)
@@ -96,12 +103,19 @@ def rearranged(graph: OnnxGraph, node: Node) -> list[Node] | None:
 def _enlarged(
     graph: OnnxGraph, node: Node, source: str, image: np.ndarray, moved: np.ndarray
 ) -> list[Node] | None:
-    """Return the Resize that moves the numbers of a map so; None if it is no enlargement (2)."""
+    """Return the operator that enlarges a map of numbers so; None if it is no enlargement (2)."""
     factor = moved.shape[2] // image.shape[2]
-    if not np.array_equal(moved, image.repeat(factor, 2).repeat(factor, 3)):
-        return None
-    scales = graph.add_constant(f"{node.result}.scales", np.array([1, 1, factor, factor]))
-    return [node.replaced_by("Resize", [source, "", scales], **OF_BLOCKS)]
+    if np.array_equal(moved, image.repeat(factor, 2).repeat(factor, 3)):
+        scales = graph.add_constant(f"{node.result}.scales", np.array([1, 1, factor, factor]))
+        return [node.replaced_by("Resize", [source, "", scales], **OF_BLOCKS)]
+    batch, channels, *_ = moved.shape
+    blocks = batch, channels, image.shape[2], factor, image.shape[3], factor
+    for mode, perm in PIXEL_SHUFFLES.items() if math.prod(blocks) == image.size else ():
+        sizes = [blocks[axis] for axis in np.argsort(perm)]
+        shuffled = image.reshape(sizes).transpose(perm).reshape(moved.shape)
+        if np.array_equal(moved, shuffled):
+            return [node.replaced_by("DepthToSpace", [source], blocksize=factor, mode=mode)]
+    return None
 
 
 def _chain(graph: OnnxGraph, node: Node) -> tuple[str, list[Node]]:

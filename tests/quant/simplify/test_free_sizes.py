@@ -151,6 +151,24 @@ class UnshuffledNoiseLevel(NoiseLevel):
         return functional.pixel_shuffle(result, 2)
 
 
+class Blocks(nn.Module):
+    """A network that enlarges maps by rearranging them, as einops does, in both orders."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.head = nn.Conv2d(1, 4 * FEATURES, 3, padding=1)
+        self.shrink = nn.Conv2d(FEATURES, 4, 3, padding=1, stride=2)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Map images (N, 1, H, W) to (N, 1, 2 H, 2 W)."""
+        batch, _, height, width = image.shape
+        wide = self.head(image).reshape(batch, FEATURES, 2, 2, height, width)
+        large = wide.permute(0, 1, 4, 2, 5, 3).reshape(batch, FEATURES, 2 * height, 2 * width)
+        blocks = self.shrink(large).reshape(batch, 2, 2, 1, height, width)
+        result: Tensor = blocks.permute(0, 3, 4, 1, 5, 2).reshape(batch, 1, 2 * height, 2 * width)
+        return result
+
+
 def exported(module: nn.Module) -> onnx.ModelProto:
     """Export a module with random weights, for any height and width."""
     generator = torch.Generator().manual_seed(1)
@@ -169,7 +187,17 @@ def exported(module: nn.Module) -> onnx.ModelProto:
 
 
 @pytest.mark.parametrize(
-    "make", [PaddedUNet, ResizedUNet, Gated, Shuffled, Repeated, NoiseLevel, UnshuffledNoiseLevel]
+    "make",
+    [
+        PaddedUNet,
+        ResizedUNet,
+        Gated,
+        Shuffled,
+        Repeated,
+        NoiseLevel,
+        UnshuffledNoiseLevel,
+        Blocks,
+    ],
 )
 def test_sizes_are_gone_and_results_are_the_same(make: Callable[[], nn.Module]) -> None:
     """Sides need not be multiples of 64, if the network halves them evenly."""
