@@ -5,8 +5,8 @@ One configuration and one tile size are predicted layer by layer; several are sw
 cannot be tiled are predicted by the frame.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,14 @@ from beers_deploy.dpu.cost.latency import Prediction
 from beers_deploy.dpu.cost.own_runs import read_own_runs
 from beers_deploy.dpu.reading import own_tile_px
 from beers_deploy.model.departure import has_other_curve
-from beers_deploy.model.exposure import exposures_for
 from beers_deploy.network import Network
-from beers_deploy.performance.swath import PAPER_SIZE, Swath, parse_size, predict_network
+from beers_deploy.performance.swath import (
+    PAPER_SIZE,
+    Swath,
+    exposed,
+    parse_size,
+    predict_network,
+)
 from beers_deploy.performance.tables import (
     LAYERS,
     PAPER_TARGET,
@@ -38,13 +43,12 @@ from beers_deploy.performance.tables import (
 )
 from beers_deploy.profiles.errors import ModelError, OptionError, printable
 from beers_deploy.profiles.figures import Row, published, unavailable
-from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.restoration.plan import make_plan, parse_halo
-from beers_deploy.restoration.steps import keeps_pixels, offset_of
-from beers_deploy.restoration.tiles.exposures import tiles_by_factor
+from beers_deploy.quant.tiling.receptive_field import Tiling
+from beers_deploy.restoration.plan import parse_halo
+from beers_deploy.restoration.steps import keeps_pixels
 from beers_deploy.results import Table
 
 Tables = list[tuple[str, list[Row]]]
@@ -170,47 +174,56 @@ def bench_board(
         raise ModelError(
             f"{error} To predict the network by the frame, leave out {' and '.join(given)}."
         ) from error
-    width_px, height_px = asked.size or parse_size(PAPER_SIZE)
-    if dn is not None:
-        height_px, width_px = dn.shape
-    halo_px = parse_halo(asked.halo, tiling.halo_px)
-    takes_step = asked.consistency and keeps_pixels(tiling)
-    tile_px = asked.tiles_px[0]
-    takes_detail = sensor is not None and has_other_curve(sensor.nominal())
-    swath = Swath(
-        width_px, height_px, tile_px, halo_px, consistency=takes_step, detail=takes_detail
-    )
-    counts = dict[float, int]()
-    if dn is not None and sensor is not None:
-        plan = make_plan((1, height_px, width_px), tile_px, halo_px, tiling)
-        # `dn` is in 0..MAX_DN whatever the bits of the sensor.
-        # The board runs the network in INT8.
-        exposures = exposures_for(sensor.nominal(), int8=True)
-        factors = [exposure.factor for exposure in exposures]
-        counts = tiles_by_factor(dn, plan, factors, MAX_DN, offset_of(sensor, MAX_DN))
-        # A tile with bright and dark pixels runs once for each exposure that its pixels ask for.
-        swath = replace(swath, runs=sum(counts.values()) / plan.tiles)
+    swaths = list[Swath]()
+    notes = list[str]()
+    for tile_px in asked.tiles_px:
+        swath = _swath(asked, tiling, tile_px, dn, sensor)
+        if dn is not None and sensor is not None:
+            swath, words = exposed(swath, dn, sensor, tiling)
+            notes += words
+        swaths.append(swath)
+    swath = swaths[0]
     targets = list({dpu.target.name: dpu.target for dpu in asked.boards}.values())
     # The paper measured the VCK190 alone: its rows belong next to no other board.
     papers = published_rows() if any(profile.name == PAPER_TARGET for profile in targets) else []
     comparison = [*(processor_row(swath, profile) for profile in targets), *papers]
-    title = f"{width_px} x {height_px} pixels"
-    notes = exposure_words(counts)
+    bands = f" of {swath.bands} bands" if swath.bands > 1 else ""
+    title = f"{swath.width_px} x {swath.height_px} pixels{bands}"
     if len(asked.boards) == len(asked.tiles_px) == 1 and asked.within_s is None:
-        prediction = predict_network(network, asked.boards[0], tile_px, asked.task, swath.step_px)
+        (dpu,) = asked.boards
+        prediction = predict_network(network, dpu, swath.tile_px, asked.task, swath.step_px)
         rows = [*predicted_rows(network.name, prediction, swath), *comparison]
-        tables = [(f"{title} in tiles of {tile_px}", rows), *asked.corrections]
+        tables = [(f"{title} in tiles of {swath.tile_px}", rows), *asked.corrections]
         tables.append(_layers(network, prediction))
         notes = [*host_words(prediction), *notes]
     else:
-        rows = sweep_rows(network, swath, asked.boards, asked.tiles_px, asked.task)
+        rows = sweep_rows(network, swaths, asked.boards, asked.task)
         if papers:
             comparison += _counted_alike(network, asked, swath)
-        sweep = f"{network.input.name}, {title} in whole tiles, halo {halo_px} px"
+        sweep = f"{network.input.name}, {title} in whole tiles, halo {swath.halo_px} px"
         tables = [(sweep, rows), (f"{title}, for comparison", comparison), *asked.corrections]
     if asked.within_s is not None:
         notes.append(within_words(rows, asked.boards, asked.within_s))
     return _table(network, asked.boards, tables, [*fitted_words(rows), *notes], swath=swath, dn=dn)
+
+
+def _swath(
+    asked: Question, tiling: Tiling, tile_px: int, dn: np.ndarray | None, sensor: Sensor | None
+) -> Swath:
+    """Return the swath in tiles of one size, of which each runs once."""
+    width_px, height_px = asked.size or parse_size(PAPER_SIZE)
+    if dn is not None:
+        height_px, width_px = dn.shape
+    restores = keeps_pixels(tiling)
+    return Swath(
+        width_px,
+        height_px,
+        tile_px,
+        parse_halo(asked.halo, tiling.halo_px),
+        bands=tiling.channels_out if restores else 1,
+        consistency=asked.consistency and restores,
+        detail=sensor is not None and has_other_curve(sensor.nominal()),
+    )
 
 
 def _counted_alike(network: Network, asked: Question, swath: Swath) -> list[Row]:
@@ -268,23 +281,6 @@ def fitted_words(rows: Sequence[Row]) -> list[str]:
         if words != "inside":
             ranges.setdefault(words, []).append(row.name)
     return [f"fitted range of {'; '.join(names)}: {words}" for words, names in ranges.items()]
-
-
-def exposure_words(counts: Mapping[float, int]) -> list[str]:
-    """Describe how often a network runs at each exposure.
-
-    Args:
-        counts: the number of runs by exposure factor, by which pixels are multiplied.
-
-    Returns:
-        A list of one sentence with the shares; empty if there are fewer than two factors.
-    """
-    if len(counts) < 2:
-        return []
-    total = sum(counts.values())
-    shares = ", ".join(f"x{factor:g} {count / total:.0%}" for factor, count in counts.items())
-    how = "runs of the network by exposure (measured on the image's pixels)"
-    return [f"{how}: {shares}; one tile may need several"]
 
 
 def _layers(network: Network, prediction: Prediction) -> tuple[str, list[Row]]:

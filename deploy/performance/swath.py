@@ -4,8 +4,10 @@ predicted of it.
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import mul
+
+import numpy as np
 
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.placement import place
@@ -14,14 +16,20 @@ from beers_deploy.dpu.cost.latency import Prediction, dpu_power, predict
 from beers_deploy.dpu.cost.model import Interval, between
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.model.consistency.step import DETAIL_PRODUCTS_PER_PX, PRODUCTS_PER_PX
+from beers_deploy.model.exposure import exposures_for
 from beers_deploy.model.raster.facts import SIDE_PX
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.figures import Figure, predicted, unavailable
+from beers_deploy.profiles.instrument import MAX_DN
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.quant.encodings import CORE, read_core
 from beers_deploy.quant.onnx_file import metadata
-from beers_deploy.restoration.plan import plan_side
+from beers_deploy.quant.tiling.receptive_field import Tiling
+from beers_deploy.restoration.plan import make_plan, plan_side
+from beers_deploy.restoration.steps import offset_of
+from beers_deploy.restoration.tiles.exposures import tiles_by_factor
 
 COST_SOURCE = "cost model fitted on published networks, docs/explanation/cost-model.md"
 HELD = 0.9
@@ -43,6 +51,7 @@ class Swath:
         height_px: the height of the image in pixels.
         tile_px: side of a tile in pixels, halo included.
         halo_px: pixels at a tile's inner borders that are computed as context and discarded.
+        bands: number of bands that a run of the network restores together.
         runs: mean number of runs of the network on a tile: one for each exposure, a factor of
             brightness, that its pixels need.
         consistency: True if the host computes the consistency step, which makes block means of the
@@ -55,6 +64,7 @@ class Swath:
     height_px: int
     tile_px: int = TILE_PX
     halo_px: int = 0
+    bands: int = 1
     runs: float = 1.0
     consistency: bool = False
     detail: bool = False
@@ -63,6 +73,11 @@ class Swath:
     def pixels(self) -> int:
         """The number of pixels of the image."""
         return self.width_px * self.height_px
+
+    @property
+    def band_pixels(self) -> int:
+        """Return the number of pixels of all bands, for steps that take the bands one by one."""
+        return self.pixels * self.bands
 
     @property
     def frames(self) -> float:
@@ -90,13 +105,41 @@ class Swath:
     def step_px(self) -> float:
         """The number of pixels of the consistency step for each run of the network.
 
-        If the step corrects finer detail too, a pixel counts as the number of pixels that take as
-        many operations without it. It is 0 without the step.
+        Each band counts. If the step corrects finer detail too, a pixel counts as the number of
+        pixels that take as many operations without it. It is 0 without the step.
         """
         if not self.consistency:
             return 0.0
         products = PRODUCTS_PER_PX + (DETAIL_PRODUCTS_PER_PX if self.detail else 0.0)
-        return self.pixels / (self.tiles * self.runs) * products / PRODUCTS_PER_PX
+        return self.band_pixels / (self.tiles * self.runs) * products / PRODUCTS_PER_PX
+
+
+def exposed(
+    swath: Swath, dn: np.ndarray, sensor: Sensor, tiling: Tiling
+) -> tuple[Swath, list[str]]:
+    """Count the exposures that the tiles of an image need. The network runs once for each.
+
+    Args:
+        swath: the image and its tiles.
+        dn: digital numbers (H, W) of the image in 0..MAX_DN, whatever the bits of the sensor.
+        sensor: the sensor that the network is conditioned on.
+        tiling: the network's tiling geometry.
+
+    Returns:
+        The swath with its mean number of runs, and a sentence with the share of each exposure (a
+        factor by which pixels are multiplied); no sentence if the network has one exposure alone.
+    """
+    plan = make_plan((1, *dn.shape), swath.tile_px, swath.halo_px, tiling)
+    # The board runs the network in INT8.
+    factors = [exposure.factor for exposure in exposures_for(sensor.nominal(), int8=True)]
+    counts = tiles_by_factor(dn, plan, factors, MAX_DN, offset_of(sensor, MAX_DN))
+    total = sum(counts.values())
+    shares = ", ".join(f"x{factor:g} {count / total:.0%}" for factor, count in counts.items())
+    words = (
+        f"runs of the network by exposure, in tiles of {swath.tile_px} (measured on the image's "
+        f"pixels): {shares}; one tile may need several"
+    )
+    return replace(swath, runs=total / plan.tiles), [words] if len(counts) > 1 else []
 
 
 def predict_network(

@@ -7,7 +7,6 @@ predicted, and the paper's figures.
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from itertools import product
 
 from beers_deploy.dpu.board import Dpu
@@ -92,16 +91,16 @@ def published_rows() -> list[Row]:
 def processor_row(swath: Swath, board: TargetProfile) -> Row:
     """Predict the traditional pipeline on the board's own processor, for comparison with a DPU.
 
-    The time is that of 10^6 pixels in the board's file, scaled by the number of pixels. If the file
-    does not state it, the latency is unavailable, and there are no throughput and no efficiency. A
-    power that the file does not state is unavailable too.
+    The time is that of 10^6 pixels in the board's file, scaled by the pixels of all bands. If the
+    file does not state it, the latency is unavailable, and there are no throughput and no
+    efficiency. A power that the file does not state is unavailable too.
 
     Args:
         swath: the image.
         board: the board.
     """
     cpu = board.tables.get("cpu", {})
-    mpx = swath.pixels / 1e6
+    mpx = swath.band_pixels / 1e6
     watts = board.tables.get("power", {}).get("cpu_run_w")
     power = unavailable("W", "no power of a run on this board's processor is published")
     if watts is not None:
@@ -163,30 +162,27 @@ MOST_TILE_PX = 8192
 
 def sweep_rows(
     network: NetworkLike,
-    swath: Swath,
+    swaths: Sequence[Swath],
     boards: Sequence[Dpu],
-    tiles_px: Sequence[int],
     task: Task | None = None,
 ) -> list[Row]:
     """Predict a swath for every combination of a configuration and a tile size.
 
     Args:
         network: the network.
-        swath: the image; its halo is used for all tile sizes.
+        swaths: the image in tiles of each size, with the runs that these tiles need.
         boards: the DPU configurations.
-        tiles_px: the sides of the tiles in pixels.
         task: the host's task with the results; None derives it from the network's operators.
 
     Returns:
         A row for each combination: all tile sizes of the first configuration, then of the next.
     """
     rows = []
-    for dpu, tile_px in product(boards, tiles_px):
-        tiled = replace(swath, tile_px=tile_px)
-        prediction = predict_network(network, dpu, tile_px, task, tiled.step_px)
-        batches = math.ceil(tiled.tiles * tiled.runs / prediction.batch)
+    for dpu, swath in product(boards, swaths):
+        prediction = predict_network(network, dpu, swath.tile_px, task, swath.step_px)
+        batches = math.ceil(swath.tiles * swath.runs / prediction.batch)
         on_chip = [not layer.work.map_bytes for layer in prediction.layers]
-        figures = swath_figures(prediction, tiled, tiled.tiles, batches) | {
+        figures = swath_figures(prediction, swath, swath.tiles, batches) | {
             "maps through memory": exact(prediction.streamed_bytes / 1e6, "MB/tile"),
             "layers on chip": exact(100 * sum(on_chip) / len(on_chip), "%"),
         }
@@ -195,7 +191,7 @@ def sweep_rows(
             # A Counter is typed to hold integers: the times are added up in picoseconds.
             bound[layer.bound] += round(1e12 * layer.time_s)
         words = {"bound": bound.most_common(1)[0][0], "fitted range": fitted_range(prediction)}
-        rows.append(Row("sweep", f"{named(dpu)}, tiles of {tile_px}", figures, words))
+        rows.append(Row("sweep", f"{named(dpu)}, tiles of {swath.tile_px}", figures, words))
     return rows
 
 

@@ -45,11 +45,11 @@ class PipelineTime:
     def row(self, swath: Swath) -> Row:
         """Predict the pipeline's figures for a whole image on this machine, as a row of `bench`.
 
-        The time is that of the median crop, scaled by the number of pixels. Its interval reaches
+        The time is that of the median crop, scaled by the pixels of all bands. Its interval reaches
         from the fastest to the slowest crop.
         """
         median = statistics.median(self.s_per_mpx)
-        mpx = swath.pixels / 1e6
+        mpx = swath.band_pixels / 1e6
         here = f"{len(self.s_per_mpx)} crops of {self.crop} on this processor, the default quality"
         ends = mpx * min(self.s_per_mpx), mpx * max(self.s_per_mpx)
         latency = predicted(mpx * median, "s", ends, f"by the pixel from {here}")

@@ -163,7 +163,7 @@ def bench_tables(model: Network, dn: np.ndarray, sensors: tuple[Sensor, Sensor])
         network = tables.predicted_rows(VARIANT, prediction, swath)
         rows.append([pipeline.row(swath), tables.processor_row(swath, dpu.target), *network])
     dpus = [load_dpu(name) for name in board_names()]
-    boards = tables.sweep_rows(model, swath, dpus, [TILE_PX])
+    boards = tables.sweep_rows(model, [swath], dpus)
     within = tables.within_words(boards, dpus, WITHIN_S)
     words = f"The same INT8 file on each board's default configuration. Of these, {within}."
     title = "A swath of {} x {}, next to the paper's figures".format(*SWATH_PX)

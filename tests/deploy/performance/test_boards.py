@@ -85,7 +85,7 @@ def test_one_table_has_all_boards_their_processors_and_the_papers_rows(
 
 def test_the_smallest_dpu_that_meets_a_time_is_named(network: Path) -> None:
     boards = [load_dpu("vck190", name) for name in ("C32B1", "C32B3", "C32B6")]
-    rows = sweep_rows(network, Swath(3000, 2600, 128, 5), boards, [256, 128])
+    rows = sweep_rows(network, [Swath(3000, 2600, tile, 5) for tile in (256, 128)], boards)
     times_s = [row.figures["latency"].value or math.inf for row in rows]
     slowest = max(times_s)
     fastest = min(times_s)
@@ -178,6 +178,38 @@ def test_the_exposures_of_an_image_are_counted_whatever_the_bits_of_the_sensor(
     assert int(shares["x1"]) > 0
     assert int(shares["x16"]) > 0
     assert int(shares["x4"]) == 0
+
+
+def test_the_exposures_of_an_image_are_those_of_each_tile_size(tmp_path: Path) -> None:
+    """A small tile needs fewer exposures, whatever sizes are compared and in which order."""
+    pixels = np.full((200, 300), 2000, np.uint16)
+    pixels[:80, :80] = 200
+    tifffile.imwrite(tmp_path / "image.tif", pixels)
+    runs = []
+    for tile in ("96,200", "200,96"):
+        table = bench("convbeers-half-xs", image=tmp_path / "image.tif", size=None, tile=tile)
+        swept = [row for row in table.rows if row.table == "sweep"]
+        runs.append({row.name: row.figures["network runs"].value for row in swept})
+        assert [note.split("tiles of ")[1][:3].strip() for note in table.notes[:2]] == tile.split(
+            ","
+        )
+    assert runs[0] == runs[1]
+    small, large = runs[0].values()
+    assert (small or 0) < (large or 0)
+
+
+def test_the_bands_that_a_network_restores_together_all_take_the_processor_s_time() -> None:
+    step_s, pipeline_s = {}, {}
+    for bands in (1, 4):
+        nodes = "a = Conv<pads=[1,1,1,1]>(image, weights) b = Relu(a) y = Add(image, b)"
+        weights = np.ones((bands, bands, 3, 3))
+        sides = f"float[1,{bands},h,w]"
+        model = parsed(nodes, f"{sides} image => {sides} y", constants={"weights": weights})
+        network, comparison, *_ = bench(model, "zcu104").rows[1:]
+        step_s[bands] = network.figures["consistency step"].value or math.nan
+        pipeline_s[bands] = comparison.figures["latency"].value or math.nan
+    assert step_s[4] == pytest.approx(4 * step_s[1])
+    assert pipeline_s[4] == pytest.approx(4 * pipeline_s[1])
 
 
 def test_a_file_for_every_sensor_has_the_exposures_of_its_name(tmp_path: Path) -> None:

@@ -112,7 +112,7 @@ def test_small_tiles_keep_maps_on_chip_and_cost_work(tmp_path: Path) -> None:
     path = integer_convbeers(tmp_path / "net.onnx", 1, 64)
     boards = [load_dpu("vck190", name) for name in ("C32B3", "C32B6")]
     tiles = (640, 128, 64)
-    rows = sweep_rows(path, Swath(700, 600, halo_px=5), boards, tiles)
+    rows = sweep_rows(path, [Swath(700, 600, tile, 5) for tile in tiles], boards)
     assert [row.name for row in rows] == [
         f"vck190 {dpu.name}, tiles of {tile}" for dpu, tile in product(boards, tiles)
     ]
