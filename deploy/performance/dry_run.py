@@ -29,7 +29,7 @@ from beers_deploy.restoration.prepare import NetworkPipeline
 from beers_deploy.restoration.radiometry import FullScale, Reading, full_scale_of
 from beers_deploy.restoration.runtime import Engine, open_runtime, tiles_at_once
 from beers_deploy.restoration.sensor_check.check import SensorCheck, checked_sensor
-from beers_deploy.restoration.steps import keeps_pixels
+from beers_deploy.restoration.steps import exposures_of, keeps_pixels
 
 HEADER = "the file's own header"
 RUNS = 3
@@ -51,7 +51,7 @@ def preview_row(
 
     Returns:
         A row with the size, the tiles, the predicted times here and on the board, the faults of
-        detectors that were found, and where the image lies.
+        detectors that were found, where the image lies, and the exposures of the network.
 
     Raises:
         MachineError: the memory is too small for the run.
@@ -90,6 +90,11 @@ def preview_row(
         "halo": plan.halo_words,
         **check.text,
     }
+    factors = sorted({1.0, *exposures_of(network, pipeline.around)})
+    if len(factors) > 1:
+        # Only the pixels tell which tiles need several, and a dry run does not read them all.
+        words = ", ".join(f"x{factor:g}" for factor in factors)
+        text["exposures"] = f"{words}; the times count one for each tile"
     return Row("restore", image.name, figures, text)
 
 

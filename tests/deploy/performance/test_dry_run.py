@@ -88,6 +88,18 @@ def test_time_on_the_board_is_the_cost_model_s(tmp_path: Path) -> None:
     assert second / first == pytest.approx(2, abs=0.1)
 
 
+def test_it_says_that_the_times_count_one_exposure(model: Path, tmp_path: Path) -> None:
+    """Most runs need several, and take that many times as long."""
+    image = tmp_path / "in.tif"
+    tifffile.imwrite(image, np.ones((40, 40), np.uint16))
+    (planned,) = restore(image, network="convbeers-half-xs-int8", dry_run=True)
+    (run,) = restore(image, tmp_path / "out.tif", network="convbeers-half-xs-int8")
+    assert (
+        planned.text["exposures"] == f"{run.text['exposures']}; the times count one for each tile"
+    )
+    assert "exposures" not in about(image, model).text
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems write its zeros")
 def test_it_reads_none_of_a_file_of_ten_gigabytes(model: Path, tmp_path: Path) -> None:
     image = tifffile.memmap(
