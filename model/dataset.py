@@ -1,4 +1,4 @@
-"""Write datasets of simulated pairs: 12-bit TIFF patches and a manifest, in parallel, resumable and
+"""Write datasets of simulated pairs: TIFF patches and a manifest, in parallel, resumable and
 reproducible byte for byte.
 
 The pixels of a patch depend on the recipe and its number only, not on the process that makes it.
@@ -221,7 +221,7 @@ def write_dataset(
     resume: bool,
     pool: Executor | None = None,
 ) -> dict[str, float]:
-    """Write a dataset of 12-bit TIFF patches and its manifest.
+    """Write a dataset of TIFF patches and its manifest.
 
     Pairs of an earlier run remain if they match the digests in their lines of the manifest; others
     are simulated again.

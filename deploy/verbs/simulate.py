@@ -74,7 +74,7 @@ def simulate(
 ) -> "Pair | Table":
     """Simulate what a sensor sees of a scene, and what a better one sees.
 
-    Pairs, of whole scenes or of patches, are written as 12-bit TIFFs degraded/NAME.tif and
+    Pairs, of whole scenes or of patches, are written as TIFFs degraded/NAME.tif and
     reference/NAME.tif.
 
     Args:
