@@ -35,7 +35,7 @@ from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.profiles.toml import read_json
 from beers_deploy.quant.float_parts import float_note
 from beers_deploy.quant.gate import GateResult, unfit_reference
-from beers_deploy.quant.limits import Limits, judge
+from beers_deploy.quant.limits import Limits, judge, not_judged
 from beers_deploy.quant.onnx_file import faults_named
 from beers_deploy.quant.samples.own import OwnSamples
 from beers_deploy.quant.structure import ENCODING, structure_checks
@@ -317,8 +317,7 @@ def judged(
     checks += file_checks(comparison.floating.model, comparison.int8, target, must_describe)
     notes = [*comparison.notes, *_mae_note(result, limits, checks)]
     notes += float_note(comparison.int8.model)
-    if result.metric and limits.metric_loss is None:
-        notes.append(f"not judged: {result.metric} lost, because `limits` sets no 'metric_loss'")
+    notes += not_judged(result, limits)
     if not any(check.name == ENCODING for check in checks):
         notes.append(
             f"not checked: {ENCODING}, because the INT8 file does not describe its integers, as a "

@@ -160,6 +160,25 @@ AT_LEAST = "PSNR float-INT8"
 """The only figure for which a larger value is better."""
 
 
+def not_judged(result: "GateResult", limits: Limits) -> list[str]:
+    """Say which checks `judge` omits although their figure was asked for or has a limit.
+
+    Returns:
+        A sentence for each check, with the reason.
+    """
+    sentences = []
+    if result.metric and limits.metric_loss is None:
+        sentences.append(
+            f"not judged: {result.metric} lost, because `limits` sets no 'metric_loss'"
+        )
+    if result.gain_db <= 0 and limits.drop_share is not None:
+        sentences.append(
+            "not judged: PSNR drop over gain, because the float network's PSNR is not above that "
+            "of its input"
+        )
+    return sentences
+
+
 def judge(
     result: "GateResult",
     limits: Limits,

@@ -255,6 +255,15 @@ def test_a_metric_without_a_limit_is_noted_as_not_judged(tmp_path: Path) -> None
         assert (note in " ".join(done(command).split())) == unjudged
 
 
+def test_a_float_network_without_a_gain_is_noted_as_not_judged_by_its_gain(tmp_path: Path) -> None:
+    np.savez(tmp_path / "s.npz", image=SAMPLES, reference=SAMPLES)
+    np.save(tmp_path / "s.npy", SAMPLES)
+    note = "not judged: PSNR drop over gain, because the float network's PSNR is not above"
+    for name, noted in (("s.npz", True), ("s.npy", False)):
+        output = done(f"gate {SMALL} --samples {tmp_path / name} --max-mae 0.1")
+        assert (note in " ".join(output.split())) == noted
+
+
 def test_references_that_do_not_fit_are_refused_and_the_sample_is_named(tmp_path: Path) -> None:
     path = tmp_path / "s.npz"
     limits = tmp_path / "limits.toml"
