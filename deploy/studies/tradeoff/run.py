@@ -216,7 +216,7 @@ def preview(study: Study) -> Table:
     Returns:
         A table of one row: the numbers of points, methods and images, and the time in seconds.
     """
-    benchmark, _ = benchmark_of(study)
+    benchmark, remarks = benchmark_of(study)
     # A float network stands for its INT8 one, because quantising would take too long here.
     points = points_for(study, require_quantizable)
     methods = _methods(points, benchmark)
@@ -251,6 +251,7 @@ def preview(study: Study) -> Table:
         arguments=study.arguments,
         inputs=study.inputs,
         rows=(Row("preview", "study", figures),),
+        notes=tuple(remarks),
         headings={"preview": ""},
     )
 
@@ -386,5 +387,9 @@ def _notes(benchmark: Benchmark, boards: Sequence[str]) -> Iterator[str]:
     yield (
         "Exact halos give the same pictures in tiles of any size; smaller ones were measured "
         "in the point's tiles."
+    )
+    yield (
+        "Board latency counts each exposure that a tile of these images needs; 'bench' counts one, "
+        "or those of its --image."
     )
     yield "The pipelines know both sensors; next to each network stands what it knows of them."

@@ -19,8 +19,10 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.onnx_file import save_onnx
+from beers_deploy.studies.evaluation.pairs import NamedPair
 from beers_deploy.studies.tradeoff.measure import (
     ROUNDS,
+    Benchmark,
     host_figures,
     host_times,
 )
@@ -161,6 +163,19 @@ def test_a_smaller_halo_takes_less_time_and_figures_follow_from_the_latency(
         WHOLE.pixels / 640**2 / exact["board latency"]
     )
     assert exact["board efficiency"] == pytest.approx(WHOLE.pixels / exact["board energy"])
+
+
+def test_the_halo_of_a_point_does_not_change_the_number_of_its_exposures() -> None:
+    """The images are small, so a point's own cut of them would say little of its tiles."""
+    image = np.full((150, 250), 2000)
+    image[:, :110] = 100
+    network = Network.load("convbeers-half-xs", sensor=SENSOR, int8=True)
+    variant = Variant(network.name, INT8, network)
+    benchmark = Benchmark([NamedPair("scene", image, image)], SENSOR, SENSOR, None, 0)
+    halos = (None, *HALOS_PX)
+    runs = {benchmark.runs(Point(variant, DPU.target, DPU, halo_px=halo)) for halo in halos}
+    assert len(runs) == 1
+    assert runs.pop() > 1
 
 
 def test_a_chain_on_a_boards_processor_takes_the_stated_time_by_the_measured_ratio() -> None:

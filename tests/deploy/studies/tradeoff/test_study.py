@@ -171,4 +171,7 @@ def test_a_preview_counts_what_is_measured_and_writes_nothing(
     assert row.figures["images"].value == SITES
     assert row.figures["time here"].mode == "predicted"
     assert (row.figures["time here"].value or 0.0) > 0
+    # It says what it leaves out and changes, as the study does.
+    assert any("Scene pixels per pixel" in note for note in table.notes)
+    assert set(table.notes) <= set(study.notes)
     assert list(working_folder.iterdir()) == []
