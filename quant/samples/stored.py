@@ -174,7 +174,16 @@ def _bands_first(path: Path, pixels: np.ndarray) -> np.ndarray:
     if bands.dtype.kind not in "ui":
         raise ImageError(f"The pixels of {path} must be numbers, got {bands.dtype}. {REMEDY}")
     # Files state no full scale: pixels of 8 bits use all of them, others are taken for 12 bits.
-    return bands / np.float32(FULL_SCALE_8 if bands.dtype.itemsize == 1 else MAX_DN)
+    full_scale = FULL_SCALE_8 if bands.dtype.itemsize == 1 else MAX_DN
+    low = int(bands.min())
+    high = int(bands.max())
+    # Otherwise such values would count as those of a network that reads another range than [0, 1].
+    if low < 0 or high > full_scale:
+        raise ImageError(
+            f"The pixels of {path} must be from 0 to {full_scale}, which is full scale, got {low} "
+            f"to {high}. Divide them by their full scale, and save them as .npy (C, H, W)."
+        )
+    return bands / np.float32(full_scale)
 
 
 def format_shape(array: np.ndarray) -> str:

@@ -142,6 +142,14 @@ def cut_off(folder: Path) -> Path:
     return path
 
 
+def folder_of(pixels: np.ndarray) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        tifffile.imwrite(folder / "x.tif", pixels)
+        return folder
+
+    return write
+
+
 @pytest.mark.parametrize(
     ("write", "message"),
     [
@@ -166,6 +174,8 @@ def cut_off(folder: Path) -> Path:
         (with_reference(np.zeros((3, 2)), ONE_CHANNEL[:, :, :0]), "has no pixels"),
         (lambda folder: folder / "missing.npy", "no such file"),
         (lambda folder: folder, "contains no sample"),
+        (folder_of(np.array([[0, 65535]], np.uint16)), r"x\.tif must be from 0 to 4095.*to 65535"),
+        (folder_of(np.array([[-7, 900]], np.int16)), "must be from 0 to 4095.*got -7 to 900"),
     ],
 )
 def test_invalid_samples_are_refused(
