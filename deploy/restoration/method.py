@@ -36,7 +36,7 @@ def network_method(
 
     Args:
         model: the network.
-        max_dn: the largest digital number, which is 1.0 to the network.
+        max_dn: the largest digital number of the images, which is 1.0 to the network.
         exposed: the same network for pixels that are multiplied by a factor, by the factor. They
             restore dark parts and strong edges; empty to omit that.
         sensor: the sensor that acquired the images; None omits the consistency step, which makes
@@ -59,7 +59,7 @@ def network_method(
         factor: AtFirstCall(partial(open_runtime, "onnxruntime", other, 0))
         for factor, other in exposed.items()
     }
-    offset = sensor.offset_dn if sensor else 0.0
+    offset = sensor.offset_dn * max_dn / sensor.max_dn if sensor else 0.0
     network = ExposedNetwork({1: infer, **at_first_call}, tiling.halo_px, offset)
     consistency = (Consistency.of(sensor, reference, max_dn),) if sensor and reference else ()
 

@@ -140,7 +140,7 @@ def method_named(name: str, degraded: Sensor, reference: Sensor, around: Around 
     sensor = Sensor.load(other) if other else degraded
     loaded = to_run_on(Network.load(network, sensor=sensor), sensor)
     weights = loaded.weights
-    method = method_of(name, loaded, sensor, reference, around, degraded.name)
+    method = method_of(name, loaded, sensor, reference, around, degraded)
     if weights is None:
         warning = other_sensor(loaded.model, sensor)
         if warning:
@@ -165,7 +165,7 @@ def method_of(
     sensor: Sensor,
     reference: Sensor,
     around: Around = BOTH,
-    acquired_by: str = "",
+    acquired_by: Sensor | None = None,
 ) -> Method:
     """Build a method from a loaded network and the steps around it.
 
@@ -175,15 +175,17 @@ def method_of(
         sensor: the sensor that the steps around the network use.
         reference: the sensor that the restoration aims at.
         around: the steps that are used: exposures and the consistency step.
-        acquired_by: the name of the images' sensor, which decides if the network knows it; empty
-            for the name of `sensor`.
+        acquired_by: the sensor of the images, whose name decides if the network knows it, and whose
+            bits decide what full scale is; `sensor` if None.
     """
-    restore = network_restore(network, sensor, reference.nominal(), around)
+    images = acquired_by or sensor
+    max_dn = images.nominal().max_dn
+    restore = network_restore(network, sensor, reference.nominal(), around, max_dn=max_dn)
     known = f"another: {network.sensor}"
     # A file without a sensor in its metadata was conditioned on none.
     if network.sensor in UNKNOWN_SENSORS:
         known = BLIND
-    elif network.sensor == (acquired_by or sensor.name):
+    elif network.sensor == images.name:
         known = KNOWN
     return Method(name, restore, known)
 
@@ -194,6 +196,7 @@ def network_restore(
     reference: Instrument,
     around: Around,
     plan_of: Callable[[tuple[int, ...]], Plan] | None = None,
+    max_dn: int | None = None,
 ) -> Restore:
     """Build the function that restores an image by a network and the steps around it.
 
@@ -206,6 +209,7 @@ def network_restore(
             factor before the network, and the consistency step, which makes the result agree with
             the raw image.
         plan_of: returns the tiles of an image, given its shape (H, W); None for the default ones.
+        max_dn: the largest digital number of the images; that of `sensor` if None.
 
     Returns:
         A function from degraded to restored digital numbers, (H, W) each.
@@ -217,7 +221,8 @@ def network_restore(
     aim = None
     if around.consistency and sensor.name != NOT_KNOWN:
         aim = reference.in_units_of(instrument)
-    return network_method(network.model, instrument.max_dn, exposed, instrument, aim, plan_of)
+    full_scale = instrument.max_dn if max_dn is None else max_dn
+    return network_method(network.model, full_scale, exposed, instrument, aim, plan_of)
 
 
 def profile_of(sensor: Instrument, like: Sensor) -> Sensor:

@@ -82,6 +82,18 @@ def test_a_file_for_every_sensor_is_the_method_of_its_shipped_name() -> None:
     assert method_named(f"{name}@blind", DEGRADED, REFERENCE).specialise is None
 
 
+def test_full_scale_is_that_of_the_images_whatever_sensor_is_supposed() -> None:
+    factor = 16383 / 4095
+    gain = DEGRADED.gain_dn_per_radiance.low * factor
+    images = DEGRADED.replace(bits=14, gain_dn_per_radiance=gain)
+    dn = np.random.default_rng(0).uniform(300, 3000, (40, 47)).astype(np.float32)
+    for supposed in ("blind", "dior-medium"):
+        name = f"convbeers-half-xs@{supposed}"
+        of_12_bits = method_named(name, DEGRADED, REFERENCE).restore(dn)
+        of_14_bits = method_named(name, images, REFERENCE).restore(dn * np.float32(factor))
+        np.testing.assert_allclose(of_14_bits / factor, of_12_bits, rtol=0, atol=0.7)
+
+
 def test_a_file_of_another_sensor_is_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
