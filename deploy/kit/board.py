@@ -138,6 +138,7 @@ class Board(TargetProfile):
         words = {
             "network": markdown_text(network.name),
             "board": markdown_text(self.name),
+            "configuration": markdown_text(self.default_configuration or "NAME"),
             "tile": tile,
             "reach": REACH_PX,
             "headroom": HEADROOM,

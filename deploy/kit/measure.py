@@ -69,7 +69,8 @@ def arguments() -> argparse.Namespace:
         metavar="KEY=VALUE",
         help="option of the provider; repeat it for several",
     )
-    add("--configuration", default="C32B3", help="DPU in the board's bitstream, C32B1 to C64B5")
+    # No default: the rate of another DPU would correct the predictions of the named one.
+    add("--configuration", required=True, help="DPU in the bitstream, such as C32B3 or B4096")
     sides = "tile side in image pixels; by default that of host.json next to the model, or 640"
     add("--tile", type=count, help=sides)
     add("--batch", type=count, default=1, help="tiles in one call")

@@ -105,6 +105,9 @@ def test_the_host_part_gives_the_host_files_bytes(name: str, tmp_path: Path) -> 
     assert {"core.onnx", "measure.py", "README.md", "golden"} < {
         path.name for path in folder.iterdir()
     }
+    # Without it measure.py would not know which DPU it measures.
+    command = "measure.py core.onnx --provider PROVIDER --configuration C32B3"
+    assert command in (folder / "README.md").read_text(encoding="utf-8")
     golden = folder / "golden"
     dims = onnx.load(golden / "core.onnx").graph.input[0].type.tensor_type.shape.dim
     planes = np.load(golden / "noise" / "00-planes.npy")

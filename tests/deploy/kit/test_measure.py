@@ -11,9 +11,20 @@ from beers_deploy.kit import measure
 from tests.deploy.dpu.graphs import board_convbeers
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["measure.py", *map(str, arguments)])
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: object, configuration: str = "C32B1") -> int:
+    named = ["--configuration", configuration]
+    monkeypatch.setattr(sys, "argv", ["measure.py", *named, *map(str, arguments)])
     return measure.main()
+
+
+def test_a_run_without_the_name_of_its_dpu_is_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It would be recorded as that of another DPU, or of one that the board does not have."""
+    monkeypatch.setattr(sys, "argv", ["measure.py", "core.onnx"])
+    with pytest.raises(SystemExit, match="2"):
+        measure.main()
+    assert "--configuration" in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_runs_are_added_to_the_list(
@@ -24,14 +35,14 @@ def test_runs_are_added_to_the_list(
     rail.write_text("22500000\n")
     provider = ("--provider", "CPUExecutionProvider")
     common = (model, *provider, "--tile", 37, "--frames", 7, "--out", out)
-    assert run(monkeypatch, *common, "--configuration", "C32B1") == 0
+    assert run(monkeypatch, *common, configuration="C32B5") == 0
     more = ("--threads", 3, "--batch", 2, "--power-file", rail, "--power-file", rail)
     assert run(monkeypatch, *common, *more) == 0
     assert capsys.readouterr().out.count("0.0 % of values differ") == 2
     first, second = json.loads(out.read_text())
     settings = {
         "model": "core.onnx",
-        "configuration": "C32B1",
+        "configuration": "C32B5",
         "tile_px": 37,
         "provider": "CPUExecutionProvider",
     }
