@@ -16,7 +16,8 @@ import sys
 from collections import deque
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from contextlib import ExitStack
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from itertools import chain, groupby, product
 from pathlib import Path
@@ -33,7 +34,7 @@ from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.plan import TOLERANCE_DN, make_plan
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene, read_scene, resample
-from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.errors import ImageError, MachineError, OptionError
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.toml import parse_json
@@ -249,15 +250,7 @@ def write_dataset(
         bar = stack.enter_context(steps("simulating", len(windows)))
         bar.advance(len(lines))
         if pool is None and workers > 1 and len(waiting) > 1:
-            # A forked copy of a library's threads can hang.
-            spawn = multiprocessing.get_context("spawn")
-            # Ctrl-C reaches each process: those of the pool end without a traceback.
-            end = signal.SIGINT, signal.SIG_DFL
-            processes = min(workers, MOST_PROCESSES)
-            pool = ProcessPoolExecutor(processes, spawn, signal.signal, end)
-            # The pool itself must cancel its calls: when its processes end while calls are
-            # cancelled from here, its thread fails with a traceback.
-            stack.callback(pool.shutdown, cancel_futures=True)
+            pool = stack.enter_context(processes(min(workers, MOST_PROCESSES)))
         for path, patches in _patches_by_path(recipe, waiting, workers, pool):
             for window, patch in zip(waiting[path], patches, strict=True):
                 for role, dn in patch.images.items():
@@ -274,6 +267,39 @@ def write_dataset(
         line = json.loads(text)
         rejected += sum(line[role]["rejected_snr_pairs"] for role in ROLES)
     return {"patches": len(lines), "rejected_share": rejected / (rejected + 2 * len(lines))}
+
+
+@contextmanager
+def processes(count: int) -> Iterator[Executor]:
+    """Start processes on this host that make patches, and end them.
+
+    Args:
+        count: the number of processes.
+
+    Yields:
+        The pool of the processes.
+
+    Raises:
+        MachineError: a process ended before its work was done.
+    """
+    # A forked copy of a library's threads can hang.
+    spawn = multiprocessing.get_context("spawn")
+    # Ctrl-C reaches each process: those of the pool end without a traceback.
+    pool = ProcessPoolExecutor(count, spawn, signal.signal, (signal.SIGINT, signal.SIG_DFL))
+    try:
+        yield pool
+    except BrokenProcessPool as error:
+        # A process first imports the script that started it. A call that is not guarded there
+        # starts processes again, which Python refuses.
+        raise MachineError(
+            "A worker process ended before its work was done: it was killed, or the script that "
+            "called it calls it again on import. Give `workers` 1, or in a script put the call "
+            "behind \"if __name__ == '__main__':\"."
+        ) from error
+    finally:
+        # The pool itself must cancel its calls: when its processes end while calls are cancelled
+        # from here, its thread fails with a traceback.
+        pool.shutdown(cancel_futures=True)
 
 
 def _chunks(windows: list[Window]) -> Iterator[list[Window]]:

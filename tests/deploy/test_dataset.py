@@ -1,5 +1,6 @@
 import json
 import logging
+import os
 import shutil
 import subprocess
 import sys
@@ -19,12 +20,13 @@ from beers_deploy.model.dataset import (
     DatasetRecipe,
     make_patches,
     plan_windows,
+    processes,
     write_dataset,
 )
 from beers_deploy.model.manifest import DIGESTS, Line, line_text
 from beers_deploy.model.progress import Step, reporting
 from beers_deploy.profiles.effects import TABLES
-from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.errors import ImageError, MachineError, OptionError
 from beers_deploy.profiles.scene_call import SceneCall, calling_for, origins, typical_effects
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import scene_names
@@ -82,6 +84,13 @@ def resume(scene: Path, folder: Path, dataset: Path) -> None:
 def test_the_bytes_do_not_depend_on_the_workers(scene: Path, dataset: Path, tmp_path: Path) -> None:
     write_dataset(small(scene), tmp_path, 2, resume=False)
     assert bytes_of(tmp_path) == bytes_of(dataset)
+
+
+def test_a_process_that_ends_early_is_one_sentence() -> None:
+    """As the processes of a script do that simulates without asking for its `__main__`."""
+    sentence = r"A worker process ended .* `workers` 1, .*__main__"
+    with pytest.raises(MachineError, match=sentence), processes(1) as pool:
+        pool.submit(os._exit, 1).result()
 
 
 def test_any_patch_can_be_simulated_again_alone(scene: Path, dataset: Path) -> None:
