@@ -187,7 +187,8 @@ def test_the_exposures_of_an_image_are_those_of_each_tile_size(tmp_path: Path) -
     tifffile.imwrite(tmp_path / "image.tif", pixels)
     runs = []
     for tile in ("96,200", "200,96"):
-        table = bench("convbeers-half-xs", image=tmp_path / "image.tif", size=None, tile=tile)
+        network = SHIPPED / "convbeers-half-xs-int8.onnx"
+        table = bench(network, image=tmp_path / "image.tif", size=None, tile=tile)
         swept = [row for row in table.rows if row.table == "sweep"]
         runs.append({row.name: row.figures["network runs"].value for row in swept})
         assert [note.split("tiles of ")[1][:3].strip() for note in table.notes[:2]] == tile.split(
