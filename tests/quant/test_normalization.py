@@ -15,9 +15,9 @@ from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.simplify import simplify
 from beers_deploy.quant.simplify.standard_operators import float_shapes
 from beers_deploy.quant.structure import structure_checks
+from tests.quant.adapt.images import HELD_OUT, SAMPLES, assert_near, squared_error
 from tests.quant.quick import changed, quickly
 from tests.quant.simplify.networks import parsed
-from tests.quant.test_adapt import HELD_OUT, SAMPLES, assert_near, squared_error
 
 CHANNELS = 6
 PX = 48
