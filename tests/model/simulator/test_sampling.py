@@ -11,7 +11,6 @@ from numpy.testing import assert_allclose
 
 from beers_deploy.model.simulator.mtf import mtf, smear_response, transfer_function
 from beers_deploy.model.simulator.sampling import resample, sample, scene_of, scene_spectrum
-from beers_deploy.profiles.response import centroid
 from beers_deploy.profiles.sensor import Sensor
 from tests.model.simulator import stages
 
@@ -57,19 +56,6 @@ def test_fused_equals_sequential(
     fused = stages.blurred(radiance, ratio, mtf_nyquist, sigma, smear)
     expected = one_after_the_other(radiance, ratio, mtf_nyquist, sigma, smear)
     assert np.abs(fused - expected).max() < 5e-4
-
-
-@pytest.mark.parametrize("smear", [0.0, 0.7, 2.0])
-@pytest.mark.parametrize("ratio", RATIOS)
-def test_nothing_is_shifted(ratio: int, smear: float) -> None:
-    result = stages.blurred(stages.blob(32 * ratio, 3.0 * ratio), ratio, 0.1, 0.2, smear)
-    assert max(map(abs, centroid(result.astype(np.float64)))) < 1e-3
-
-
-@pytest.mark.parametrize("ratio", [2, 4, 6])
-def test_plain_slicing_would_shift_at_even_ratios(ratio: int) -> None:
-    sliced = stages.blob(32 * ratio, 3.0 * ratio)[ratio // 2 :: ratio, ratio // 2 :: ratio]
-    assert abs(centroid(sliced.astype(np.float64))[0]) == pytest.approx(0.5 / ratio, rel=0.05)
 
 
 @pytest.mark.parametrize("factor", [1, 16])

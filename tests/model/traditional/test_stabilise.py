@@ -24,11 +24,12 @@ def noisy(radiance: float, sensor: Instrument, seed: int) -> torch.Tensor:
     return torch.from_numpy(radiance + sensor.noise_sigma(radiance) * normal)
 
 
+@pytest.mark.parametrize("sensor", LIMITS)
 @pytest.mark.parametrize("radiance", [5.0, 25.0, 100.0, 390.0])
-def test_noise_has_variance_one_at_every_radiance(radiance: float) -> None:
-    assert float(stabilise(noisy(radiance, NOMINAL, 1), NOMINAL).var()) == pytest.approx(
-        1, abs=0.03
-    )
+def test_noise_has_variance_one_at_every_radiance(radiance: float, sensor: Instrument) -> None:
+    """As alpha nears 0, the difference of two roots would vanish in float32."""
+    stable = stabilise(noisy(radiance, sensor, 1).float(), sensor)
+    assert float(stable.var()) == pytest.approx(1, abs=0.03)
 
 
 @pytest.mark.parametrize("sensor", LIMITS)
@@ -43,14 +44,6 @@ def test_below_zero_it_rises_and_is_inverted() -> None:
     stable = stabilise(radiance, NOMINAL)
     assert bool((stable.diff() > 0).all())
     torch.testing.assert_close(destabilise(stable, NOMINAL), radiance, rtol=1e-5, atol=1e-6)
-
-
-def test_alpha_to_zero_is_a_division_where_the_difference_of_roots_vanishes() -> None:
-    sensor = replace(NOMINAL, alpha=1e-7, beta=0.25)
-    radiance = torch.tensor([50.0, 50.5])
-    roots = (sensor.alpha * radiance + sensor.beta).sqrt() - sensor.beta**0.5
-    assert float(roots.diff() * 2 / sensor.alpha) == 0
-    assert float(stabilise(radiance, sensor).diff()) == pytest.approx(1, rel=1e-3)
 
 
 def test_no_noise_in_the_dark_is_finite() -> None:
