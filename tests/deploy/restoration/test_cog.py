@@ -10,14 +10,12 @@ import pytest
 import rasterio
 from numpy.testing import assert_allclose, assert_array_equal
 
-from beers_deploy.model.io.files import sha256
 from beers_deploy.model.raster.compression import Compression
 from beers_deploy.model.raster.writer import cog_bytes
 from beers_deploy.profiles.errors import MachineError
 from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import names, stop_after
 from tests.model.raster import formats as images
-from tests.shipped import shipped_pair
 
 cogeo: Any = pytest.importorskip("rio_cogeo")
 
@@ -52,19 +50,6 @@ def test_a_cog_is_valid_and_equals_the_plain_output(
         assert (after.compression and after.compression.value.lower()) == codecs[compression]
         predictor = after.tags(ns="IMAGE_STRUCTURE").get("PREDICTOR")
     assert predictor == (None if compression == "none" else "2")
-
-
-def test_it_records_what_was_done(tmp_path: Path) -> None:
-    int8 = shipped_pair("convbeers-xs")[1]
-    image = images.write_tiff(tmp_path / "in.tif")
-    restore(image, tmp_path / "cog.tif", network=int8, cog=True)
-    with rasterio.open(tmp_path / "cog.tif") as file:
-        tags = file.tags()
-    assert tags["RESTORED_NETWORK_SHA256"] == sha256(int8)
-    assert tags["RESTORED_NETWORK"] == "convbeers-xs"
-    assert tags["RESTORED_SENSOR"] == "pleiades-degraded"
-    assert tags["RESTORED_FULL_SCALE"] == "4095 (assumed: 12 bits)"
-    assert tags["RESTORED_BY"].startswith("beers-deploy ")
 
 
 def test_a_run_that_stops_while_it_writes_can_be_resumed(

@@ -3,14 +3,12 @@
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import rasterio
 from numpy.testing import assert_allclose
 from rasterio.control import GroundControlPoint
 
 from beers_deploy.model.raster.reader import open_raster
-from beers_deploy.model.raster.source import fingerprint
 from beers_deploy.profiles.errors import BeersError, ImageError
 from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import refused
@@ -77,13 +75,3 @@ def test_a_tile_of_the_input_cannot_be_an_output(model: Path, tmp_path: Path) ->
     for words in (out, "--dry-run"):
         assert tile.name in refused(f"restore {image} {words} --json {tile}")
         assert tile.read_bytes() == before
-
-
-def test_a_changed_tile_changes_the_fingerprint(tmp_path: Path) -> None:
-    image = images.write_vrt(tmp_path / "a.vrt")
-    with open_raster(image) as source:
-        before = fingerprint(source.files)
-    images.write_jp2(
-        tmp_path / "R64C80.jp2", np.zeros((2, images.HEIGHT - 64, images.WIDTH - 80), np.uint16)
-    )
-    assert fingerprint(source.files) != before

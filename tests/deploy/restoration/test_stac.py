@@ -109,7 +109,11 @@ def test_an_item_states_how_the_image_was_restored(tmp_path: Path) -> None:
     asset = network.assets["model"]
     digest = sha256((tmp_path / asset.href).read_bytes()).hexdigest()
     assert asset.extra_fields["file:checksum"] == f"1220{digest}"
+    # These are the tags of the image, too.
     assert about["restored_network_sha256"] == digest
+    assert about["restored_network"] == "convbeers-xs"
+    assert about["restored_sensor"] == "pleiades-degraded"
+    assert about["restored_by"].startswith("beers-deploy ")
     model = mlm.MLMExtension.ext(network)
     assert model.architecture == "ConvBEERS"
     assert model.hyperparameters.to_dict() == {"precision": "int8", "sensor": "pleiades-degraded"}
