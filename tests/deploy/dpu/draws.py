@@ -1,23 +1,21 @@
-"""Functions that add nodes between two convolutions, place networks on a DPU, and list the rules
-that they break.
+"""Nodes between two convolutions, functions that place networks on a DPU, and the rules that they
+break.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from unittest.mock import patch
 
-import numpy as np
 import onnx
 
 from beers_deploy.dpu.board import Dpu, load_dpu
 from beers_deploy.dpu.checker.placement import PlacedNode, Placement, place
 from beers_deploy.dpu.reading import read_network
-from tests.deploy.dpu.graphs import Sketch, Value
+from tests.deploy.dpu.graphs import SAME, written
 
-Draw = Callable[[Sketch, str], str]
 DPU = load_dpu("vck190")
 TILE_PX = 288
 
@@ -52,87 +50,36 @@ def rules_of(nodes: Iterable[PlacedNode]) -> list[str]:
     return [violation.rule for violation in violations]
 
 
-def between_convs(draw: Draw, dpu: Dpu = DPU, channels: int = 8) -> list[str]:
-    """Return the rules that a network with `draw` between two convolutions breaks."""
-    sketch = Sketch(channels)
-    middle = draw(sketch, sketch.conv("image", (channels, channels, 1, 1)))
-    result = sketch.node("AveragePool", middle, kernel_shape=[1, 1])
-    return broken_rules(sketch.model(sketch.conv(result, (1, channels, 1, 1))), dpu=dpu)
+def between_convs(nodes: str, dpu: Dpu = DPU, channels: int = 8) -> list[str]:
+    """Return the rules that nodes from `x` to `y` break between two convolutions."""
+    first = f"x = Conv(image, w{channels}x{channels}x1x1)"
+    last = f"p = AveragePool<kernel_shape=[1,1]>(y) z = Conv(p, w1x{channels}x1x1)"
+    return broken_rules(written(f"{first} {nodes} {last}", channels, ("z",)), dpu=dpu)
 
 
-def conv(*weight: int, **attributes: Value) -> Draw:
-    return lambda sketch, source: sketch.conv(source, weight, **attributes)
+CONV = f"y = {SAME}(x, w)"
 
 
-def transposed(*weight: int, **attributes: Value) -> Draw:
-    return lambda sketch, source: sketch.node(
-        "ConvTranspose", source, sketch.weight(*weight), **attributes
-    )
+def behind_conv(node: str) -> str:
+    """Return a convolution of `x` and a node that reads it as `a` and writes `y`."""
+    return f"a = {SAME}(x, w) y = {node}"
 
 
-def node(op_type: str, **attributes: Value) -> Draw:
-    return lambda sketch, source: sketch.node(op_type, source, **attributes)
+def behind_depthwise(node: str) -> str:
+    return f"a = Conv<pads=[1,1,1,1], group=8>(x, w8x1x3x3) y = {node}"
 
 
-def scaled(*shape: int) -> Draw:
-    return lambda sketch, source: sketch.node("Mul", source, sketch.weight(*shape))
+def behind_sum(node: str) -> str:
+    return f"a = Add(x, x) y = {node}"
 
 
-def resized(scale: float, **attributes: Value) -> Draw:
-    return lambda sketch, source: sketch.node(
-        "Resize",
-        source,
-        "",
-        sketch.constant(np.array([1, 1, scale, scale], np.float32)),
-        **attributes,
-    )
+def behind_mean(node: str) -> str:
+    return f"a = AveragePool<kernel_shape=[2,2]>(x) y = {node}"
 
 
-def padded(mode: str) -> Draw:
-    pads = np.array([0, 0, 2, 2, 0, 0, 2, 2], np.int64)
-    return lambda sketch, source: sketch.node("Pad", source, sketch.constant(pads), mode=mode)
+def behind_pool(node: str) -> str:
+    return f"a = MaxPool<kernel_shape=[2,2]>(x) y = {node}"
 
 
-def in_two(first: Draw, second: Draw) -> Draw:
-    """Return a draw that applies `first` and then `second`."""
-    return lambda sketch, source: second(sketch, first(sketch, source))
-
-
-def conv_3x3(**attributes: Value) -> Draw:
-    return conv(8, 8, 3, 3, **attributes)
-
-
-def depthwise(height: int, width: int, **attributes: Value) -> Draw:
-    return conv(8, 1, height, width, group=8, **attributes)
-
-
-def max_pool(rows: int, columns: int, **attributes: Value) -> Draw:
-    return node("MaxPool", kernel_shape=[rows, columns], **attributes)
-
-
-def doubled(sketch: Sketch, source: str) -> str:
-    return sketch.node("Add", source, source)
-
-
-def behind_conv(op_type: str, **attributes: Value) -> Draw:
-    return in_two(conv_3x3(), node(op_type, **attributes))
-
-
-def behind_depthwise(op_type: str, **attributes: Value) -> Draw:
-    return in_two(depthwise(3, 3), node(op_type, **attributes))
-
-
-def behind_sum(op_type: str, **attributes: Value) -> Draw:
-    return in_two(doubled, node(op_type, **attributes))
-
-
-def mean_pool() -> Draw:
-    return node("AveragePool", kernel_shape=[2, 2])
-
-
-def behind_mean(op_type: str) -> Draw:
-    return in_two(mean_pool(), node(op_type))
-
-
-def behind_pool(op_type: str, **attributes: Value) -> Draw:
-    return in_two(max_pool(2, 2), node(op_type, **attributes))
+def depthwise(window: str, rows: int, columns: int) -> str:
+    return f"y = Conv<group=8, {window}>(x, w8x1x{rows}x{columns})"

@@ -1,10 +1,12 @@
 """Small ONNX files built node by node, for the tests of the checker and the cost model."""
 
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 import onnx
+from numpy.typing import ArrayLike
 from onnx import TensorProto, helper, numpy_helper
 
 from tests.quant.simplify.networks import parsed
@@ -58,38 +60,47 @@ class Sketch:
 
 
 SAME = "Conv<pads=[1,1,1,1]>"
+NUMBERS: dict[str, ArrayLike] = {
+    "two": [1.0, 1.0, 2.0, 2.0],
+    "three": [1.0, 1.0, 3.0, 3.0],
+    "eight": [1.0, 1.0, 8.0, 8.0],
+    "around": [0, 0, 2, 2, 0, 0, 2, 2],
+}
 MYSTERY = f"a = {SAME}(image, w) b = com.microsoft.Mystery(a) y = {SAME}(b, w)"
 """An operator that nobody knows, between two convolutions."""
 
 
-def written(
-    nodes: str, channels: int = 8, results: tuple[str, ...] = ("y",), **shapes: tuple[int, ...]
-) -> onnx.ModelProto:
+def written(nodes: str, channels: int = 8, results: tuple[str, ...] = ("y",)) -> onnx.ModelProto:
     """Return a float network from `image`, in ONNX's text format.
 
     Args:
-        nodes: they may read `w`, weights of 3 x 3 for 8 channels, and `eight`, the factors of an
-            enlargement.
+        nodes: they may read weights of zeros that are named by their shape, such as `w4x8x3x3`, or
+            `w` for `w8x8x3x3`, and the factors and pads of NUMBERS.
         channels: the number of channels of the image.
         results: the names of the outputs.
-        shapes: the shapes of other weights, which are all 0.
     """
-    weights = {name: np.zeros(shape) for name, shape in shapes.items()}
-    constants = {"w": np.zeros((8, 8, 3, 3)), "eight": [1.0, 1.0, 8.0, 8.0], **weights}
+    constants = {**NUMBERS, "w": np.zeros((8, 8, 3, 3))}
+    for name in re.findall(r"\bw[0-9x]+\b", nodes):
+        constants[name] = np.zeros([int(size) for size in name[1:].split("x")])
     outputs = ", ".join(f"float[N,C,P,Q] {name}" for name in results)
     return parsed(nodes, f"float[N,{channels},H,W] image => {outputs}", constants=constants)
 
 
 def float_convbeers(path: Path, blocks: int, features: int) -> Path:
     """Write ConvBEERS in float: head, residual blocks, body end, tail, global add."""
-    sketch = Sketch(channels=1)
-    wide = (features, features, 3, 3)
-    stream = head = sketch.conv("image", (features, 1, 3, 3))
-    for _ in range(blocks):
-        inner = sketch.node("Relu", sketch.conv(stream, wide))
-        stream = sketch.node("Add", stream, sketch.conv(inner, wide))
-    deep = sketch.node("Add", head, sketch.conv(stream, wide))
-    return sketch.save(path, sketch.node("Add", "image", sketch.conv(deep, (1, features, 3, 3))))
+    wide = f"w{features}x{features}x3x3"
+    body = " ".join(
+        f"a{k} = {SAME}(s{k}, {wide}) r{k} = Relu(a{k}) b{k} = {SAME}(r{k}, {wide}) "
+        f"s{k + 1} = Add(s{k}, b{k})"
+        for k in range(blocks)
+    )
+    nodes = f"""
+        s0 = {SAME}(image, w{features}x1x3x3) {body}
+        end = {SAME}(s{blocks}, {wide}) deep = Add(s0, end)
+        tail = {SAME}(deep, w1x{features}x3x3) y = Add(image, tail)
+    """
+    onnx.save_model(written(nodes, 1), path)
+    return path
 
 
 class IntegerSketch(Sketch):

@@ -22,7 +22,6 @@ from beers_deploy.profiles.shipped import board_names, npu_names
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.onnx_file import load_onnx
 from tests.deploy.dpu.draws import (
-    Draw,
     as_written,
     behind_conv,
     behind_depthwise,
@@ -31,106 +30,102 @@ from tests.deploy.dpu.draws import (
     behind_sum,
     between_convs,
     broken_rules,
-    conv,
     depthwise,
-    doubled,
-    in_two,
 )
-from tests.deploy.dpu.graphs import Sketch, written
+from tests.deploy.dpu.graphs import written
 from tests.shipped import shipped_pair
 
 DPUS = {name: load_dpu(name) for name in board_names()}
 ZYNQ = ("kv260", "zcu102", "zcu104")
 KINDS = {"DPUCZDX8G": ZYNQ, "DPUCVDX8G": ("vck190",), "DPUCV2DX8G": ("vek280",)}
-ALPHA = 26 / 256
-UNPADDED = [0] * 4
+LEAKY = "LeakyRelu<alpha=0.1015625>(a)"
+PRELU = "PRelu(a, w8x1x1)"
+UNPADDED = "pads=[0,0,0,0]"
 
 
-def prelu(s: Sketch, x: str) -> str:
-    return s.node("PRelu", x, s.weight(8, 1, 1))
+def in_two(rows: int, columns: int) -> str:
+    """Return a depthwise convolution as one of its rows and one of its columns."""
+    first = f"a = Conv<group=8>(x, w8x1x{rows}x1)"
+    return f"{first} y = Conv<group=8>(a, w8x1x1x{columns})"
 
 
-# Each case: the only boards that refuse it, the rule, the network, the network with the remedy
-# followed, and its channels.
-CASES: list[tuple[tuple[str, ...], str, Draw, Draw, int]] = [
+# Each case: the only boards that refuse it, the rule, the nodes, the nodes with the remedy
+# followed, and their channels.
+CASES: list[tuple[tuple[str, ...], str, str, str, int]] = [
     (
         ZYNQ,
         "conv weight bank",
-        conv(8, 1312, 5, 5),
-        in_two(conv(1296, 1312, 1, 1), conv(8, 1296, 5, 5)),
+        "y = Conv<pads=[2,2,2,2]>(x, w8x1312x5x5)",
+        "a = Conv(x, w1296x1312x1x1) y = Conv<pads=[2,2,2,2]>(a, w8x1296x5x5)",
         1312,
     ),
     (
         (*ZYNQ, "vek280"),
         "depthwise kernel",
-        depthwise(64, 33, pads=UNPADDED),
-        in_two(depthwise(64, 1, pads=UNPADDED), depthwise(1, 33, pads=UNPADDED)),
+        depthwise(UNPADDED, 64, 33),
+        in_two(64, 33),
         8,
     ),
-    (
-        ZYNQ,
-        "activation place",
-        behind_depthwise("LeakyRelu", alpha=ALPHA),
-        behind_depthwise("Relu"),
-        8,
-    ),
-    (ZYNQ, "activation of sums", behind_sum("LeakyRelu", alpha=ALPHA), behind_sum("Relu"), 8),
-    (("vek280",), "conv area", conv(8, 8, 8, 8, pads=[3] * 4), conv(8, 8, 7, 7), 8),
+    (ZYNQ, "activation place", behind_depthwise(LEAKY), behind_depthwise("Relu(a)"), 8),
+    (ZYNQ, "activation of sums", behind_sum(LEAKY), behind_sum("Relu(a)"), 8),
     (
         ("vek280",),
-        "depthwise kernel",
-        depthwise(21, 21, pads=UNPADDED),
-        in_two(depthwise(21, 1, pads=UNPADDED), depthwise(1, 21, pads=UNPADDED)),
+        "conv area",
+        "y = Conv<pads=[3,3,3,3]>(x, w8x8x8x8)",
+        "y = Conv<pads=[3,3,3,3]>(x, w8x8x7x7)",
         8,
     ),
-    (("vek280",), "activation place", prelu, behind_conv("Relu"), 8),
-    (("vek280",), "activation of sums", in_two(doubled, prelu), behind_sum("Relu"), 8),
-    (("vck190",), "conv window", conv(8, 8, 9, 8, pads=UNPADDED), conv(8, 8, 7, 7), 8),
+    (("vek280",), "depthwise kernel", depthwise(UNPADDED, 21, 21), in_two(21, 21), 8),
+    (("vek280",), "activation place", "y = PRelu(x, w8x1x1)", behind_conv("Relu(a)"), 8),
+    (("vek280",), "activation of sums", behind_sum(PRELU), behind_sum("Relu(a)"), 8),
+    (
+        ("vck190",),
+        "conv window",
+        "y = Conv(x, w8x8x9x8)",
+        "y = Conv<pads=[3,3,3,3]>(x, w8x8x7x7)",
+        8,
+    ),
 ]
 
 
-@pytest.mark.parametrize(("boards", "rule", "draw", "remedied", "channels"), CASES)
+@pytest.mark.parametrize(("boards", "rule", "nodes", "remedied", "channels"), CASES)
 def test_a_rule_refuses_its_case_on_its_boards_alone_and_the_remedy_passes_on_every_board(
-    boards: tuple[str, ...], rule: str, draw: Draw, remedied: Draw, channels: int
+    boards: tuple[str, ...], rule: str, nodes: str, remedied: str, channels: int
 ) -> None:
     for name, dpu in DPUS.items():
         with as_written():
-            rules = between_convs(draw, dpu, channels)
+            rules = between_convs(nodes, dpu, channels)
         # The VEK280 refuses a wide window by its conv area, which is tighter.
         if (name, rule) != ("vek280", "conv window"):
             assert rules == ([rule] if name in boards else [])
         assert between_convs(remedied, dpu, channels) == []
 
 
-def argmax_of(channels: int) -> Draw:
-    return lambda s, x: s.node("ArgMax", s.conv(x, (channels, 8, 1, 1)), axis=1)
-
-
 @pytest.mark.parametrize(
-    ("draw", "boards"),
+    ("nodes", "boards"),
     [
         # The simplifier inserts a convolution that changes nothing in front of the ReLU.
-        (behind_mean("Relu"), set(DPUS)),
+        (behind_mean("Relu(a)"), set(DPUS)),
         # The simplifier moves the ReLU in front of the max pool: the result is the same.
-        (behind_pool("Relu"), set(DPUS)),
-        (behind_sum("HardSwish"), set(DPUS)),
-        (behind_depthwise("HardSwish"), set(DPUS)),
-        (behind_conv("HardSigmoid"), set(DPUS)),
-        (behind_sum("HardSigmoid"), set(DPUS)),
-        (argmax_of(128), {*ZYNQ, "vek280"}),
-        (argmax_of(129), {"vek280"}),
-        (conv(4097, 8, 1, 1), {"vek280"}),
+        (behind_pool("Relu(a)"), set(DPUS)),
+        (behind_sum("HardSwish(a)"), set(DPUS)),
+        (behind_depthwise("HardSwish(a)"), set(DPUS)),
+        (behind_conv("HardSigmoid(a)"), set(DPUS)),
+        (behind_sum("HardSigmoid(a)"), set(DPUS)),
+        ("a = Conv(x, w128x8x1x1) y = ArgMax<axis=1>(a)", {*ZYNQ, "vek280"}),
+        ("a = Conv(x, w129x8x1x1) y = ArgMax<axis=1>(a)", {"vek280"}),
+        ("y = Conv(x, w4097x8x1x1)", {"vek280"}),
         # The simplifier splits it into parts of three rows.
-        (conv(8, 8, 16, 16, pads=[7] * 4), set(DPUS)),
-        (conv(8, 8, 16, 16, pads=UNPADDED), set(DPUS)),
+        ("y = Conv<pads=[7,7,7,7]>(x, w8x8x16x16)", set(DPUS)),
+        ("y = Conv(x, w8x8x16x16)", set(DPUS)),
     ],
 )
-def test_which_boards_accept_an_operator(draw: Draw, boards: set[str]) -> None:
-    assert {name for name, dpu in DPUS.items() if not between_convs(draw, dpu)} == boards
+def test_which_boards_accept_an_operator(nodes: str, boards: set[str]) -> None:
+    assert {name for name, dpu in DPUS.items() if not between_convs(nodes, dpu)} == boards
 
 
 def test_a_smaller_dpu_accepts_fewer_channels() -> None:
-    model = written("y = Conv(image, wide)", wide=(2049, 8, 1, 1))
+    model = written("y = Conv(image, w2049x8x1x1)")
     for size, rules in (("B512", ["conv channels"]), ("B1152", []), (None, [])):
         assert broken_rules(model, dpu=load_dpu("zcu102", size)) == rules
 

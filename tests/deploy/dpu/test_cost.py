@@ -2,7 +2,6 @@ import math
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
 
 from beers_deploy.dpu.board import load_dpu
@@ -15,7 +14,6 @@ from beers_deploy.profiles.errors import ModelError
 from tests.deploy.dpu.draws import DPU, placed
 from tests.deploy.dpu.graphs import (
     SAME,
-    Sketch,
     board_convbeers,
     float_convbeers,
     integer_convbeers,
@@ -78,9 +76,9 @@ def test_unused_rows_columns_and_channels_of_the_array_take_time_too(
     assert wide.array_use == 2 * 9 * 40**2 * 97**2 / wide.array_operations
 
 
-def works_of(model: onnx.ModelProto, side_px: int) -> tuple[Work, ...]:
+def works_of(nodes: str, channels: int, side_px: int) -> tuple[Work, ...]:
     """Return the work of each layer of a network."""
-    return count_work(placed(model, side_px).core, DPU)
+    return count_work(placed(written(nodes, channels), side_px).core, DPU)
 
 
 def moved(works: tuple[Work, ...]) -> int:
@@ -93,11 +91,13 @@ def test_the_input_of_three_branches_passes_through_memory() -> None:
     maps = {}
     burst = BURST_BYTES / 16
     for branches in (2, 3):
-        s = Sketch(16)
-        stem = s.conv("image", (16, 16, 3, 3))
-        joined = s.node("Concat", *(s.conv(stem, (16, 16, 1, 1)) for _ in range(branches)), axis=1)
-        works = works_of(s.model(s.conv(joined, (8, 16 * branches, 1, 1))), 32)
-        maps[branches] = moved(works) / (16 * 32 * 32)
+        names = [f"b{k}" for k in range(branches)]
+        nodes = f"""
+            stem = {SAME}(image, w16x16x3x3)
+            {" ".join(f"{name} = Conv(stem, w16x16x1x1)" for name in names)}
+            joined = Concat<axis=1>({", ".join(names)}) y = Conv(joined, w8x{16 * branches}x1x1)
+        """
+        maps[branches] = moved(works_of(nodes, 16, 32)) / (16 * 32 * 32)
     image = 1
     result = 0.5
     assert maps == {2: image + 2 * burst + 2 + result, 3: image + 1 + 3 + 3 * burst + 3 + result}
@@ -107,9 +107,12 @@ def test_the_input_of_three_branches_passes_through_memory() -> None:
 def test_the_inputs_of_a_concat_are_stored_in_bursts_and_loaded_again(
     channels: tuple[int, int],
 ) -> None:
-    s = Sketch(8)
-    joined = s.node("Concat", *(s.conv("image", (count, 8, 3, 3)) for count in channels), axis=1)
-    works = works_of(s.model(s.conv(joined, (8, sum(channels), 1, 1))), 33)
+    first, second = channels
+    nodes = f"""
+        a = {SAME}(image, w{first}x8x3x3) b = {SAME}(image, w{second}x8x3x3)
+        joined = Concat<axis=1>(a, b) y = Conv(joined, w8x{first + second}x1x1)
+    """
+    works = works_of(nodes, 8, 33)
     padded_channels = [BURST_BYTES * math.ceil(count / BURST_BYTES) for count in channels]
     assert [work.store_map_bytes for work in works] == [
         33 * 33 * count for count in (*padded_channels, 0, 8)
@@ -121,16 +124,13 @@ def test_the_inputs_of_a_concat_are_stored_in_bursts_and_loaded_again(
 @pytest.mark.parametrize("convs", [1, 2])
 def test_an_add_of_maps_beyond_the_chip_loads_one_of_them(side: int, maps: int, convs: int) -> None:
     """The other map comes from the operation before. Maps that fit on the chip are not moved."""
-    sums = []
-    wide = (32, 32, 3, 3)
-    for added in (False, True):
-        s = Sketch(32)
-        x = first = s.conv("image", wide)
-        for _ in range(convs):
-            x = s.conv(x, wide)
-        last = s.conv(s.node("Add", x, first) if added else x, (8, 32, 1, 1))
-        sums.append(moved(works_of(s.model(last), side)))
-    assert sums[1] - sums[0] == maps * 32 * side * side
+    chain = " ".join(f"x{k + 1} = {SAME}(x{k}, w32x32x3x3)" for k in range(convs))
+    nodes = f"x0 = {SAME}(image, w32x32x3x3) {chain}"
+    without, added = (
+        moved(works_of(f"{nodes} sum = {last} y = Conv(sum, w8x32x1x1)", 32, side))
+        for last in (f"Identity(x{convs})", f"Add(x{convs}, x0)")
+    )
+    assert added - without == maps * 32 * side * side
 
 
 @pytest.mark.parametrize("board", ["vck190", "zcu104"])
@@ -149,11 +149,10 @@ def test_the_load_of_an_add_is_not_hidden(tmp_path: Path, board: str) -> None:
 def test_a_pixel_shuffle_costs_the_bursts_of_its_pieces(block: int) -> None:
     """The three channels of each pixel take a burst. The host shuffles at the network's end."""
     map_bytes = {}
-    wide = (3 * block**2, 3, 3, 3)
-    nodes = f"a = {SAME}(image, wide) b = DepthToSpace<blocksize={block}>(a)"
-    for place_in, end, count in (("end", "Identity(b)", 1), ("middle", "Conv(b, last)", 2)):
-        model = written(f"{nodes} y = {end}", 3, wide=wide, last=(3, 3, 1, 1))
-        works = works_of(model, 512)
+    wide = f"w{3 * block**2}x3x3x3"
+    nodes = f"a = {SAME}(image, {wide}) b = DepthToSpace<blocksize={block}>(a)"
+    for place_in, end, count in (("end", "Identity(b)", 1), ("middle", "Conv(b, w3x3x1x1)", 2)):
+        works = works_of(f"{nodes} y = {end}", 3, 512)
         assert len(works) == count
         map_bytes[place_in] = works[0].store_map_bytes
     values = 3 * block**2 * 512 * 512
@@ -169,10 +168,10 @@ def test_a_transposed_convolution_runs_as_one_convolution_for_each_phase(
     So the DPU computes no inserted zeros.
     """
     window = f"strides={[stride] * 2}, pads={[0, 0, kernel - stride, kernel - stride]}"
-    grown = f"y = ConvTranspose<{window}>(image, up)"
-    (work,) = works_of(written(grown, 32, up=(32, 32, kernel, kernel)), 64)
-    phase = f"y = Conv<pads={[0, 0, taps - 1, taps - 1]}>(image, part)"
-    (other,) = works_of(written(phase, 32, part=(32, 32, taps, taps)), 64)
+    grown = f"y = ConvTranspose<{window}>(image, w32x32x{kernel}x{kernel})"
+    (work,) = works_of(grown, 32, 64)
+    phase = f"y = Conv<pads={[0, 0, taps - 1, taps - 1]}>(image, w32x32x{taps}x{taps})"
+    (other,) = works_of(phase, 32, 64)
     assert work.array_operations == stride**2 * other.array_operations
     assert (work.array_operations == work.operations) is (kernel % stride == 0)
 
@@ -230,9 +229,9 @@ def test_of_the_maps_of_yolo_a_sort_reads_one_score_for_each_box(
     channels: tuple[int, ...], read: int
 ) -> None:
     """YOLO has three boxes a pixel. Of other maps, such as the classes of SSD, a sort reads all."""
-    sketch = Sketch(8)
-    maps = [sketch.conv("image", (count, 8, 3, 3)) for count in channels]
-    assert placed_work(placed(sketch.model(*maps), 32), "sort")[5] == pytest.approx(read * 32 * 32)
+    maps = [f"y{k} = {SAME}(image, w{count}x8x3x3)" for k, count in enumerate(channels)]
+    model = written(" ".join(maps), results=tuple(f"y{k}" for k in range(len(maps))))
+    assert placed_work(placed(model, 32), "sort")[5] == pytest.approx(read * 32 * 32)
 
 
 def test_latency_is_that_of_one_core_and_one_thread(tmp_path: Path) -> None:

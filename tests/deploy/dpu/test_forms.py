@@ -8,8 +8,9 @@ from tests.deploy.dpu.graphs import written
 
 def placed_conv(weight: tuple[int, ...], tile_px: int, *pads: int) -> PlacedNode:
     """Place a convolution over a map of `tile_px` pixels a side."""
-    nodes = f"y = Conv<pads={[*pads] or [0] * 4}>(image, last)"
-    return placed(written(nodes, weight[1], last=weight), tile_px).nodes[-1]
+    name = "x".join(map(str, weight))
+    nodes = f"y = Conv<pads={[*pads] or [0] * 4}>(image, w{name})"
+    return placed(written(nodes, weight[1]), tile_px).nodes[-1]
 
 
 def test_a_layer_as_large_as_its_map_is_also_one_pixel_of_all_its_values() -> None:

@@ -9,7 +9,7 @@ import pytest
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.operators import all_rules, rule_name
 from tests.deploy.dpu.draws import (
-    Draw,
+    CONV,
     as_written,
     behind_conv,
     behind_mean,
@@ -17,87 +17,94 @@ from tests.deploy.dpu.draws import (
     behind_sum,
     between_convs,
     broken_rules,
-    conv,
-    conv_3x3,
     depthwise,
-    doubled,
-    in_two,
-    max_pool,
-    mean_pool,
-    node,
-    padded,
     placed,
-    resized,
-    scaled,
-    transposed,
 )
-from tests.deploy.dpu.graphs import SAME, IntegerSketch, Sketch, written
+from tests.deploy.dpu.graphs import SAME, IntegerSketch, written
 from tests.deploy.dpu.test_number_graphs import CASES as NUMBER_CASES
 
 NARROW_ARRAY = "C32B1"
 
 
 # Each rule with a network that breaks it alone, and the same network with the remedy followed.
-CASES: dict[str, tuple[Draw, Draw]] = {
-    "conv kernel": (conv(8, 8, 17, 1), conv(8, 8, 15, 1)),
-    "conv stride": (conv_3x3(strides=[9, 9]), conv_3x3(strides=[3, 3])),
-    "conv padding": (conv_3x3(pads=[3, 1, 1, 1]), conv_3x3(pads=[2, 1, 1, 1])),
-    "conv window": (conv(8, 8, 9, 8, pads=[0] * 4), conv(8, 8, 8, 8)),
+CASES: dict[str, tuple[str, str]] = {
+    "conv kernel": (
+        "y = Conv<pads=[8,0,8,0]>(x, w8x8x17x1)",
+        "y = Conv<pads=[7,0,7,0]>(x, w8x8x15x1)",
+    ),
+    "conv stride": (
+        "y = Conv<pads=[1,1,1,1], strides=[9,9]>(x, w)",
+        "y = Conv<pads=[1,1,1,1], strides=[3,3]>(x, w)",
+    ),
+    "conv padding": ("y = Conv<pads=[3,1,1,1]>(x, w)", "y = Conv<pads=[2,1,1,1]>(x, w)"),
+    "conv window": ("y = Conv(x, w8x8x9x8)", "y = Conv<pads=[4,4,4,4]>(x, w8x8x8x8)"),
     "conv dilation": (
-        conv(8, 8, 3, 1, dilations=[513, 1], pads=[513, 0, 513, 0]),
-        conv(8, 8, 3, 1, dilations=[512, 1], pads=[513, 0, 513, 0]),
+        "y = Conv<dilations=[513,1], pads=[513,0,513,0]>(x, w8x8x3x1)",
+        "y = Conv<dilations=[512,1], pads=[513,0,513,0]>(x, w8x8x3x1)",
     ),
-    "conv groups": (conv(8, 4, 3, 3, group=2), conv_3x3()),
+    "conv groups": ("y = Conv<pads=[1,1,1,1], group=2>(x, w8x4x3x3)", CONV),
     "depthwise kernel": (
-        depthwise(257, 1, pads=[15, 0, 15, 0]),
-        depthwise(255, 1, pads=[0] * 4),
+        depthwise("pads=[15,0,15,0]", 257, 1),
+        depthwise("pads=[0,0,0,0]", 255, 1),
     ),
-    "depthwise stride": (depthwise(3, 3, strides=[257, 1]), depthwise(3, 3)),
+    "depthwise stride": (
+        depthwise("pads=[1,1,1,1], strides=[257,1]", 3, 3),
+        depthwise("pads=[1,1,1,1]", 3, 3),
+    ),
     "depthwise padding": (
-        depthwise(3, 3, pads=[16, 1, 1, 1]),
-        depthwise(3, 3, pads=[15, 1, 9, 9]),
+        depthwise("pads=[16,1,1,1]", 3, 3),
+        depthwise("pads=[15,1,9,9]", 3, 3),
     ),
     "transposed kernel": (
-        transposed(8, 8, 2, 2, strides=[3, 3]),
-        transposed(8, 8, 4, 4, strides=[2, 2]),
+        "y = ConvTranspose<strides=[3,3]>(x, w8x8x2x2)",
+        "y = ConvTranspose<strides=[2,2]>(x, w8x8x4x4)",
     ),
     "transposed output padding": (
-        transposed(8, 8, 3, 3, strides=[2, 2], output_padding=[1, 1]),
-        transposed(8, 8, 4, 4, strides=[2, 2], pads=[1, 1, 1, 1]),
+        "y = ConvTranspose<strides=[2,2], output_padding=[1,1]>(x, w8x8x3x3)",
+        "y = ConvTranspose<strides=[2,2], pads=[1,1,1,1]>(x, w8x8x4x4)",
     ),
     "transposed padding": (
-        transposed(8, 8, 2, 2, pads=[3, 0, 0, 0]),
-        transposed(8, 8, 2, 2, pads=[2, 0, 0, 0]),
+        "y = ConvTranspose<pads=[3,0,0,0]>(x, w8x8x2x2)",
+        "y = ConvTranspose<pads=[2,0,0,0]>(x, w8x8x2x2)",
     ),
-    "pool kernel": (max_pool(257, 1), max_pool(17, 1)),
+    "pool kernel": (
+        "y = MaxPool<kernel_shape=[257,1]>(x)",
+        "y = MaxPool<kernel_shape=[17,1]>(x)",
+    ),
     "pool stride": (
-        max_pool(2, 2, strides=[257, 1]),
-        max_pool(2, 2),
+        "y = MaxPool<kernel_shape=[2,2], strides=[257,1]>(x)",
+        "y = MaxPool<kernel_shape=[2,2]>(x)",
     ),
     "pool padding": (
-        max_pool(20, 20, pads=[16, 0, 0, 0]),
-        max_pool(20, 20, pads=[15, 0, 0, 0]),
+        "y = MaxPool<kernel_shape=[20,20], pads=[16,0,0,0]>(x)",
+        "y = MaxPool<kernel_shape=[20,20], pads=[15,0,0,0]>(x)",
     ),
-    "activation place": (behind_mean("Relu"), in_two(node("Relu"), mean_pool())),
-    "activation of sums": (behind_sum("HardSwish"), behind_sum("Relu")),
+    "activation place": (
+        behind_mean("Relu(a)"),
+        "a = Relu(x) y = AveragePool<kernel_shape=[2,2]>(a)",
+    ),
+    "activation of sums": (behind_sum("HardSwish(a)"), behind_sum("Relu(a)")),
     "leaky relu alpha": (
-        behind_conv("LeakyRelu", alpha=0.1),
-        behind_conv("LeakyRelu", alpha=26 / 256),
+        behind_conv("LeakyRelu<alpha=0.1>(a)"),
+        behind_conv("LeakyRelu<alpha=0.1015625>(a)"),
     ),
-    "mul constant": (scaled(1, 8, 3, 3), scaled(1, 8, 1, 1)),
-    "pad mode": (padded("reflect"), padded("constant")),
-    "resize mode": (resized(2, mode="cubic"), resized(2, mode="nearest")),
-    "resize scale": (resized(3, mode="linear"), resized(2, mode="linear")),
+    "mul constant": ("y = Mul(x, w1x8x3x3)", "y = Mul(x, w1x8x1x1)"),
+    "pad mode": ('y = Pad<mode="reflect">(x, around)', 'y = Pad<mode="constant">(x, around)'),
+    "resize mode": (
+        'y = Resize<mode="cubic">(x, , two)',
+        'y = Resize<mode="nearest">(x, , two)',
+    ),
+    "resize scale": (
+        'y = Resize<mode="linear">(x, , three)',
+        'y = Resize<mode="linear">(x, , two)',
+    ),
     "shuffle place": (
-        behind_pool("DepthToSpace", blocksize=1),
-        node("DepthToSpace", blocksize=1),
+        behind_pool("DepthToSpace<blocksize=1>(a)"),
+        "y = DepthToSpace<blocksize=1>(x)",
     ),
-    "argmax channels": (node("ArgMax", axis=1), behind_conv("Relu")),
-    "known operator": (behind_conv("Sigmoid"), behind_conv("HardSigmoid")),
-    "operator domain": (
-        behind_conv("FusedRelu", domain="com.microsoft"),
-        behind_conv("Relu"),
-    ),
+    "argmax channels": ("y = ArgMax<axis=1>(x)", behind_conv("Relu(a)")),
+    "known operator": (behind_conv("Sigmoid(a)"), behind_conv("HardSigmoid(a)")),
+    "operator domain": (behind_conv("com.microsoft.FusedRelu(a)"), behind_conv("Relu(a)")),
 }
 WIDE = {
     "conv channels",
@@ -145,72 +152,68 @@ def test_each_rule_refuses_its_case_alone_and_following_the_remedy_passes(rule: 
     assert between_convs(follows) == []
 
 
-def joined(sketch: Sketch, source: str) -> str:
-    return sketch.node("Concat", source, source, axis=1)
-
-
 @pytest.mark.parametrize(
-    ("rules", "draw", "channels"),
+    ("rules", "nodes", "channels"),
     [
-        (["conv channels"], conv(4097, 8, 1, 1), 8),
-        (["conv weight bank"], conv(1, 2048, 8, 8, pads=[3] * 4), 2048),
-        (["transposed channels"], transposed(8, 4097, 1, 1), 8),
-        (["depthwise channels"], conv(4097, 1, 3, 3, group=4097), 4097),
-        (["resize channels"], resized(2, mode="nearest"), 4097),
+        (["conv channels"], "y = Conv(image, w4097x8x1x1)", 8),
+        (["conv weight bank"], "y = Conv<pads=[3,3,3,3]>(image, w1x2048x8x8)", 2048),
+        (["transposed channels"], "y = ConvTranspose(image, w8x4097x1x1)", 8),
+        (
+            ["depthwise channels"],
+            "y = Conv<pads=[1,1,1,1], group=4097>(image, w4097x1x3x3)",
+            4097,
+        ),
+        (["resize channels"], 'y = Resize<mode="nearest">(image, , two)', 4097),
         # Each convolution in front of the sum is allowed.
-        (["elementwise channels"], in_two(conv(2049, 8, 1, 1), in_two(joined, doubled)), 8),
+        (
+            ["elementwise channels"],
+            "a = Conv(image, w2049x8x1x1) b = Concat<axis=1>(a, a) y = Add(b, b)",
+            8,
+        ),
         (
             ["conv channels", "shuffle channels"],
-            in_two(
-                conv(4100, 8, 1, 1),
-                in_two(node("DepthToSpace", blocksize=2), conv(8, 1025, 1, 1)),
-            ),
+            """a = Conv(image, w4100x8x1x1) b = DepthToSpace<blocksize=2>(a)
+            y = Conv(b, w8x1025x1x1)""",
             8,
         ),
     ],
 )
-def test_wide_layers(rules: list[str], draw: Draw, channels: int) -> None:
+def test_wide_layers(rules: list[str], nodes: str, channels: int) -> None:
     """A layer of too many channels or weights is refused by the rule about its own kind alone."""
-    sketch = Sketch(channels)
-    assert broken_rules(sketch.model(draw(sketch, "image"))) == rules
+    assert broken_rules(written(nodes, channels)) == rules
 
 
-def halved_and_enlarged(sketch: Sketch, source: str) -> str:
-    """Draw a sum of a map with itself, halved and enlarged."""
-    half = sketch.node("MaxPool", source, kernel_shape=[2, 2], strides=[2, 2])
-    return sketch.node("Add", source, resized(2)(sketch, half))
-
-
-def attended(sketch: Sketch, source: str) -> str:
-    """Draw a factor of one value a channel, as channel attention has."""
-    mean = sketch.node("GlobalAveragePool", source)
-    return sketch.node("Mul", source, sketch.conv(mean, (8, 8, 1, 1)))
+ENLARGED = f"""
+    a = MaxPool<kernel_shape=[2,2], strides=[2,2]>(x) b = Resize(a, , two) c = Add(x, b)
+    y = {SAME}(c, w)
+"""
+"""The sum of a map with itself, halved and enlarged."""
+ATTENDED = f"a = GlobalAveragePool(x) b = Conv(a, w8x8x1x1) c = Mul(x, b) y = {SAME}(c, w)"
+"""A map times a factor of one value a channel, as channel attention has."""
 
 
 @pytest.mark.parametrize(
-    ("draw", "tile_px", "rules"),
+    ("nodes", "tile_px", "rules"),
     [
         # A tile smaller than an unpadded kernel leaves no map, and one of its size leaves one.
-        (conv_3x3(pads=[0] * 4), 2, ["map exists"]),
-        (conv_3x3(pads=[0] * 4), 3, []),
+        ("y = Conv(x, w)", 2, ["map exists"]),
+        ("y = Conv(x, w)", 3, []),
         # An odd tile halved and doubled is another size.
-        (in_two(halved_and_enlarged, conv_3x3()), 21, ["maps aligned"]),
-        (in_two(halved_and_enlarged, conv_3x3()), 22, []),
+        (ENLARGED, 21, ["maps aligned"]),
+        (ENLARGED, 22, []),
         # The factor needs no map of the same size.
-        (in_two(attended, conv_3x3()), 37, []),
+        (ATTENDED, 37, []),
     ],
 )
-def test_maps_of_the_sizes_of_a_tile(draw: Draw, tile_px: int, rules: list[str]) -> None:
-    sketch = Sketch(8)
+def test_maps_of_the_sizes_of_a_tile(nodes: str, tile_px: int, rules: list[str]) -> None:
     # Behind padding, because the image of a network without any is mirrored.
-    stream = sketch.conv("image")
-    assert broken_rules(sketch.model(draw(sketch, stream)), tile_px) == rules
+    model = written(f"x = {SAME}(image, w) {nodes}")
+    assert broken_rules(model, tile_px) == rules
 
 
 def test_a_tile_that_the_memory_cannot_hold() -> None:
     """A tile whose maps exceed the memory is refused, and the remedy's factor makes it fit."""
-    nodes = f"a = {SAME}(image, first) y = {SAME}(a, last)"
-    model = written(nodes, 1, first=(64, 1, 3, 3), last=(1, 64, 3, 3))
+    model = written(f"a = {SAME}(image, w64x1x3x3) y = {SAME}(a, w1x64x3x3)", 1)
     tile_px = 7001
     (violation,) = placed(model, tile_px).nodes[0].broken
     assert violation.rule == "map in memory"
@@ -224,9 +227,9 @@ def test_a_tile_that_the_memory_cannot_hold() -> None:
 
 def test_all_broken_rules_of_a_node_are_listed() -> None:
     """All faults of a node are reported at once, so that a user does not find them one by one."""
-    draw = conv(8, 4, 17, 9, group=2, strides=[9, 1], pads=[0, 0, 20, 0])
+    window = "group=2, strides=[9,1], pads=[0,0,20,0]"
     with as_written():
-        rules = between_convs(draw)
+        rules = between_convs(f"y = Conv<{window}>(x, w8x4x17x9)")
     assert rules == ["conv kernel", "conv stride", "conv padding", "conv window", "conv groups"]
 
 
@@ -240,7 +243,7 @@ def test_a_float_convolution_in_a_quantized_file_is_refused() -> None:
 
 def test_findings_name_the_numbers_and_a_remedy() -> None:
     """A finding states the number that broke the rule, the limit, and what to do."""
-    model = written("y = Conv<pads=[8,0,8,0]>(image, long)", long=(8, 8, 17, 1))
+    model = written("y = Conv<pads=[8,0,8,0]>(image, w8x8x17x1)")
     (violation,) = placed(model).nodes[0].broken
     assert violation.finding.reason == "kernel (1 x 17) is not in the DPU's range 1 to 16"
     assert "at most 16" in violation.finding.remedy

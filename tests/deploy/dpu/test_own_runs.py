@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import onnx
 import pytest
 
 from beers_deploy.dpu.board import Dpu, load_dpu
@@ -13,7 +14,7 @@ from beers_deploy.dpu.cost.latency import Prediction
 from beers_deploy.dpu.cost.own_runs import OwnRuns, read_own_runs
 from beers_deploy.performance.swath import predict_network
 from beers_deploy.profiles.errors import OptionError
-from tests.deploy.dpu.graphs import Sketch, integer_convbeers
+from tests.deploy.dpu.graphs import integer_convbeers, written
 
 DPU = load_dpu("vck190")
 RUN = '{"model": "deep.onnx", "fps": 3}'
@@ -27,8 +28,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("runs")
     integer_convbeers(path / "deep.onnx", 4, 64)
     integer_convbeers(path / "kin.onnx", 3, 48)
-    sketch = Sketch(8)
-    sketch.save(path / "flat.onnx", sketch.conv("image", (1, 8, 1, 1)))
+    onnx.save_model(written("y = Conv(image, w1x8x1x1)"), path / "flat.onnx")
     return path
 
 

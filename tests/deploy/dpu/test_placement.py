@@ -45,7 +45,7 @@ def test_a_branch_past_the_cpu_does_not_join_the_two_subgraphs() -> None:
 
 
 def test_scaling_in_front_is_the_hosts_but_other_operators_are_refused() -> None:
-    placement = placed(written(f"a = Div(image, one) y = {SAME}(a, w)", one=(1,)), 21)
+    placement = placed(written(f"a = Div(image, w1) y = {SAME}(a, w)"), 21)
     assert [node.part for node in placement.nodes] == ["host-front", "dpu-core"]
     placement = placed(written(f"a = Softmax<axis=1>(image) y = {SAME}(a, w)"), 21)
     assert [node.device for node in placement.nodes] == ["CPU", "DPU"]
@@ -54,17 +54,17 @@ def test_scaling_in_front_is_the_hosts_but_other_operators_are_refused() -> None
 def test_pixels_are_moved_to_channels_and_back_by_the_host_at_the_ends_alone() -> None:
     nodes = f"""
         a = SpaceToDepth<blocksize=2>(image) b = {SAME}(a, w) c = DepthToSpace<blocksize=2>(b)
-        d = {SAME}(c, last) y = DepthToSpace<blocksize=2>(d)
+        d = {SAME}(c, w8x2x3x3) y = DepthToSpace<blocksize=2>(d)
     """
-    placement = placed(written(nodes, 2, last=(8, 2, 3, 3)), 20)
+    placement = placed(written(nodes, 2), 20)
     assert [node.part for node in placement.nodes] == ["host-front", *["dpu-core"] * 3, "host-back"]
     assert placement.failed == ()
     assert remarks_on(placement, DPU, 20)["shuffles"].startswith(placement.nodes[2].op.name)
 
 
 def test_the_host_computes_the_end_of_a_classifier() -> None:
-    nodes = f"a = {SAME}(image, w) b = GlobalAveragePool(a) c = Flatten(b) d = Gemm(c, last)"
-    model = written(f"{nodes} y = Softmax<axis=1>(d)", last=(8, 3))
+    nodes = f"a = {SAME}(image, w) b = GlobalAveragePool(a) c = Flatten(b) d = Gemm(c, w8x3)"
+    model = written(f"{nodes} y = Softmax<axis=1>(d)")
     del model.graph.output[0].type.tensor_type.shape.dim[2:]
     kinds = [(node.op.op_type, node.part) for node in placed(model, 21).nodes]
     assert kinds[:3] == [(kind, "dpu-core") for kind in ("Conv", "GlobalAveragePool", "Conv")]

@@ -44,7 +44,7 @@ def test_a_model_fixed_to_another_tile_is_refused_with_its_tile(tmp_path: Path) 
 
 
 def test_inputs_that_are_no_images_are_refused(tmp_path: Path) -> None:
-    model = written("y = Add(image, one)", one=(1,))
+    model = written("y = Add(image, w1)")
     del model.graph.input[0].type.tensor_type.shape.dim[3]
     onnx.save(model, tmp_path / "i.onnx")
     with pytest.raises(ModelError, match="inputs"):

@@ -19,10 +19,10 @@ from tests.quant.test_host_end import float_network
 
 def segmenter(where: str, behind: str = "") -> onnx.ModelProto:
     """Build a network that enlarges scores of 19 classes from an eighth of the size."""
-    nodes = "a = Conv<pads=[1,1,1,1], strides=[8,8]>(image, first) b = Conv(a, last)"
+    nodes = "a = Conv<pads=[1,1,1,1], strides=[8,8]>(image, w32x3x3x3) b = Conv(a, w19x32x1x1)"
     large = f'Resize<mode="linear", coordinate_transformation_mode="{where}">(b, , eight)'
     end = f"c = {large} y = {behind}(c)" if behind else f"y = {large}"
-    return written(f"{nodes} {end}", 3, first=(32, 3, 3, 3), last=(19, 32, 1, 1))
+    return written(f"{nodes} {end}", 3)
 
 
 def predicted(where: str) -> Prediction:
@@ -97,12 +97,11 @@ def heads() -> onnx.ModelProto:
     It first moves the image's pixels to channels.
     """
     nodes = f"""
-        a = SpaceToDepth<blocksize=2>(image) b = {SAME}(a, first)
-        c = Conv<pads=[1,1,1,1], strides=[2,2]>(b, second)
-        d = Conv(b, half) y = Sigmoid(d) e = Conv(c, quarter) z = Sigmoid(e)
+        a = SpaceToDepth<blocksize=2>(image) b = {SAME}(a, w16x12x3x3)
+        c = Conv<pads=[1,1,1,1], strides=[2,2]>(b, w32x16x3x3)
+        d = Conv(b, w255x16x1x1) y = Sigmoid(d) e = Conv(c, w255x32x1x1) z = Sigmoid(e)
     """
-    wide = {"first": (16, 12, 3, 3), "second": (32, 16, 3, 3)}
-    return written(nodes, 3, ("y", "z"), **wide, half=(255, 16, 1, 1), quarter=(255, 32, 1, 1))
+    return written(nodes, 3, ("y", "z"))
 
 
 def test_several_heads_are_copied_and_are_no_image() -> None:
@@ -116,10 +115,9 @@ def test_several_heads_are_copied_and_are_no_image() -> None:
 
 
 def test_results_of_few_bands_become_an_image_and_scores_do_not() -> None:
-    nodes = f"a = {SAME}(image, last) y = DepthToSpace<blocksize=2>(a)"
     for channels, task in ((12, "image"), (76, "copy")):
-        model = written(nodes, 3, last=(channels, 3, 3, 3))
-        assert predict_network(model, DPU, 64).task == task
+        nodes = f"a = {SAME}(image, w{channels}x3x3x3) y = DepthToSpace<blocksize=2>(a)"
+        assert predict_network(written(nodes, 3), DPU, 64).task == task
 
 
 def test_what_the_host_computes_in_float_takes_time_in_both_files() -> None:

@@ -8,32 +8,35 @@ import pytest
 from onnxruntime.quantization import QuantFormat, QuantType
 
 from tests.deploy.dpu.draws import placed, rules_of
-from tests.deploy.dpu.graphs import Sketch
+from tests.deploy.dpu.graphs import SAME
 from tests.quant.quick import quantized_freely
+from tests.quant.simplify.networks import parsed
 
 TILE_PX = 34
 
 
-class RandomSketch(Sketch):
-    """A sketch whose weights calibrate to sensible scales."""
-
-    def weight(self, *shape: int) -> str:
-        return self.constant(
-            np.random.default_rng(len(self.constants)).normal(0, 0.1, shape).astype(np.float32)
-        )
-
-    def biased(self, source: str, *shape: int) -> str:
-        return self.node("Conv", source, self.weight(*shape), self.weight(shape[0]), pads=[1] * 4)
+SHAPES = {
+    "head": (8, 1, 3, 3),
+    "inner": (8, 8, 3, 3),
+    "outer": (8, 8, 3, 3),
+    "up": (8, 8, 4, 4),
+    "last": (1, 8, 3, 3),
+}
 
 
 def float_network() -> onnx.ModelProto:
     """Build convolutions with bias, a residual add, a pool and a transposed convolution."""
-    s = RandomSketch(1)
-    head = s.biased("image", 8, 1, 3, 3)
-    stream = s.node("Add", head, s.biased(s.node("Relu", s.biased(head, 8, 8, 3, 3)), 8, 8, 3, 3))
-    pooled = s.node("MaxPool", stream, kernel_shape=[2, 2], strides=[2, 2])
-    up = s.node("ConvTranspose", pooled, s.weight(8, 8, 4, 4), strides=[2, 2], pads=[1] * 4)
-    return s.model(s.biased(s.node("LeakyRelu", up, alpha=26 / 256), 1, 8, 3, 3))
+    generator = np.random.default_rng(0)
+    constants = {f"{name}_w": generator.normal(0, 0.1, shape) for name, shape in SHAPES.items()}
+    constants |= {f"{name}_b": generator.normal(0, 0.1, shape[0]) for name, shape in SHAPES.items()}
+    nodes = f"""
+        a = {SAME}(image, head_w, head_b)
+        b = {SAME}(a, inner_w, inner_b) c = Relu(b) d = {SAME}(c, outer_w, outer_b)
+        e = Add(a, d) f = MaxPool<kernel_shape=[2,2], strides=[2,2]>(e)
+        g = ConvTranspose<strides=[2,2], pads=[1,1,1,1]>(f, up_w)
+        h = LeakyRelu<alpha=0.1015625>(g) y = {SAME}(h, last_w, last_b)
+    """
+    return parsed(nodes, "float[N,1,H,W] image => float[N,1,P,Q] y", constants=constants)
 
 
 @pytest.mark.parametrize(
