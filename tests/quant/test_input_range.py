@@ -212,18 +212,15 @@ def test_numpy_onnx_and_description_agree(
         assert limits[0] <= restored.min() <= restored.max() <= limits[1]
 
 
-def test_limits_are_stored_for_images_in_the_usual_range_too() -> None:
+@pytest.mark.parametrize(
+    ("limits", "stored"), [((0.0, 1.0), ()), ((0.25, 0.5), (0.25, 0.5))], ids=["usual", "narrow"]
+)
+def test_limits_are_stored_for_images_in_the_usual_range_too(
+    limits: tuple[float, float], stored: tuple[float, ...]
+) -> None:
     """The network's clip is stored, except one to [0, 1], which storing an image applies anyway."""
-    usual = (0.0, 1.0)
-    narrow = (0.25, 0.5)
-    assert limits_of(usual) == ()
-    assert limits_of(narrow) == narrow
-
-
-def limits_of(limits: tuple[float, float]) -> tuple[float, ...]:
-    """Return the limits in the INT8 network of a float network with these limits."""
     int8 = quickly(network(1, 1, limits=limits), patches(shares(1)))
-    return int8.core.host_part.clip_limits
+    assert int8.core.host_part.clip_limits == stored
 
 
 @given(PAIRS, st.integers(0, MAX_DN))

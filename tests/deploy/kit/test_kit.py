@@ -1,6 +1,4 @@
-"""Tests of the kit for a board's engineer: its host part computes the host file's bytes, and its
-record states what it is.
-"""
+"""Tests of the kit for a board's engineer: its host part computes the host file's bytes."""
 
 import json
 import logging
@@ -14,8 +12,6 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
-from cyclonedx.schema import SchemaVersion
-from cyclonedx.validation.json import JsonStrictValidator
 from numpy.testing import assert_allclose, assert_array_equal
 
 import beers_deploy as bd
@@ -34,7 +30,6 @@ from beers_deploy.profiles.errors import MachineError, OptionError, ProfileError
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.sensor_bank.calibrate import bank_results, quantize_behind_bank
 from beers_deploy.quant.session import open_session, tensors_of
-from tests.deploy.command_line import done
 from tests.deploy.kit.test_golden import NORMALISED, network
 from tests.model.networks import behind_a_bank
 from tests.profiles.own_sensor import departing, edited, own_sensor
@@ -369,36 +364,6 @@ def test_a_network_for_another_sensor_is_a_warning(
         BOARD.kit(other, tmp_path / "kit", tile=TILE_PX, sensor="pleiades-degraded")
     (warning,) = caplog.messages
     assert "made for dior-medium, not for pleiades-degraded" in warning
-
-
-def test_a_record_states_what_a_network_is_and_what_was_checked(tmp_path: Path) -> None:
-    """The record names licence, training images, hashes and checks, and its bill of materials is
-    valid.
-
-    A reviewer can so trace the network without asking its authors.
-    """
-    pair = "convbeers-xs", "convbeers-xs-int8"
-    done("gate", *pair, "--patches", 2, "--record", tmp_path / "gate")
-    record = json.loads((tmp_path / "gate" / RECORD[0]).read_text(encoding="utf-8"))
-    assert record["passed"]
-    assert record["licence"] == "Apache-2.0"
-    assert len(record["training"]["images"]) >= 50
-    assert record["network"]["sha256"] in {entry["sha256"] for entry in record["results"]["inputs"]}
-    assert len(record["tool"]["code_sha256"]) == 64
-    text = (tmp_path / "gate" / RECORD[2]).read_text(encoding="utf-8")
-    assert JsonStrictValidator(SchemaVersion.V1_6).validate_str(text) is None
-    assert "All checks passed" in (tmp_path / "gate" / RECORD[1]).read_text(encoding="utf-8")
-
-
-def test_unknown_facts_of_a_users_network_are_recorded_as_unknown(tmp_path: Path) -> None:
-    """Facts that are unknown of a user's network are recorded as unknown."""
-    folder = bd.Board.load("zcu102").kit(network("unet"), tmp_path / "kit", tile=64, record=True)
-    record = json.loads((folder / "record" / RECORD[0]).read_text(encoding="utf-8"))
-    assert record["results"]["command"] == "check"
-    for fact in ("training", "licence", "weights_sha256", "sensors_in_range"):
-        assert record[fact] is None
-    assert len(record["says"]["calibration_samples"].split()) == 3
-    onnx.checker.check_model(onnx.load(folder / "core.onnx"))
 
 
 def test_for_an_npu_the_core_is_what_its_compiler_reads(tmp_path: Path) -> None:

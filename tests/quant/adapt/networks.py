@@ -1,7 +1,7 @@
 """Networks with operators that a DPU lacks, as exporters write them."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import onnx
@@ -137,7 +137,7 @@ NUMBERS: dict[str, ArrayLike] = {
 
 
 def built(
-    nodes: str, shapes: dict[str, tuple[int, ...]], px: int | None = None, **constants: ArrayLike
+    nodes: str, shapes: Mapping[str, tuple[int, ...]], px: int | None = None, **constants: ArrayLike
 ) -> onnx.ModelProto:
     """Return a network from `image` to `restored`, simplified.
 
