@@ -1,5 +1,6 @@
 """Tests of the command `check`: its tables, its document and its verdict."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +30,16 @@ def tables(path: Path) -> dict[str, list[dict[str, Any]]]:
     return by_name
 
 
-def test_convbeers_passes_whole_in_every_encoding(tmp_path: Path) -> None:
-    for make in (float_convbeers, integer_convbeers, board_convbeers):
-        out = tmp_path / "o.json"
-        output = done("check", make(tmp_path / "n.onnx", 16, 64), "--json", out)
-        assert "check passed" in output
-        assert valid(out)["verdict"] == "passed"
-        (summary,) = tables(out)["summary"]
-        assert summary["figures"]["DPU subgraphs"]["value"] == 1
+@pytest.mark.parametrize("make", [float_convbeers, integer_convbeers, board_convbeers])
+def test_convbeers_passes_whole_in_every_encoding(
+    make: Callable[[Path, int, int], Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "o.json"
+    output = done("check", make(tmp_path / "n.onnx", 16, 64), "--json", out)
+    assert "check passed" in output
+    assert valid(out)["verdict"] == "passed"
+    (summary,) = tables(out)["summary"]
+    assert summary["figures"]["DPU subgraphs"]["value"] == 1
 
 
 def test_a_network_of_one_tile_is_checked_at_that(tmp_path: Path) -> None:

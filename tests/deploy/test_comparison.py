@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -61,11 +62,10 @@ def test_the_judged_file_does_not_choose_its_samples(model: Path) -> None:
     assert "7 of 7 samples" in second.notes[0]
 
 
-def test_numbers_of_another_type_are_refused_in_a_sentence() -> None:
-    for wrong in ({"patches": "1"}, {"seed": "1"}, {"metric": ["psnr"]}):
-        (name,) = wrong
-        with pytest.raises(OptionError, match=f"`{name}` must be"):
-            bd.compare("convbeers-xs", **wrong)
+@pytest.mark.parametrize(("name", "value"), [("patches", "1"), ("seed", "1"), ("metric", ["psnr"])])
+def test_numbers_of_another_type_are_refused_in_a_sentence(name: str, value: Any) -> None:
+    with pytest.raises(OptionError, match=f"`{name}` must be"):
+        bd.compare("convbeers-xs", **{name: value})
 
 
 def test_samples_smaller_than_the_mirrored_border_are_refused() -> None:

@@ -163,17 +163,20 @@ def test_none_is_the_default_network() -> None:
     assert Network.load(None) == Network.load(f"{VARIANT}{INT8}")
 
 
-def test_one_name_loads_a_shipped_pair() -> None:
-    for floating, int8 in (
+@pytest.mark.parametrize(
+    ("floating", "int8"),
+    [
         ("convbeers-xs", None),
         ("convbeers-xs-int8", None),
         ("convbeers-xs", "convbeers-xs"),
         ("convbeers-xs", "convbeers-xs-int8"),
-    ):
-        pair = pair_of(floating, int8, KNOWN)
-        assert [each.name for each in pair] == ["convbeers-xs", "convbeers-xs-int8"]
-        assert [each.precision for each in pair] == ["float32", "int8"]
-        assert {each.sensor for each in pair} == {SENSOR}
+    ],
+)
+def test_one_name_loads_a_shipped_pair(floating: str, int8: str | None) -> None:
+    pair = pair_of(floating, int8, KNOWN)
+    assert [each.name for each in pair] == ["convbeers-xs", "convbeers-xs-int8"]
+    assert [each.precision for each in pair] == ["float32", "int8"]
+    assert {each.sensor for each in pair} == {SENSOR}
 
 
 def test_export_writes_a_shipped_networks_integers_for_the_host_and_the_board(

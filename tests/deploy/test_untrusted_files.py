@@ -33,10 +33,12 @@ from tests.fuzz.networks import checkpoint_seeds, go_on
 from tests.fuzz.parsers import JOB, SHAPE
 
 
-def test_a_name_too_long_for_the_disk_is_a_sentence(tmp_path: Path) -> None:
-    for reader, name in ((load_onnx, "a" * 5000 + ".onnx"), (read_pixels, "a" * 5000 + ".tif")):
-        with pytest.raises(BeersError, match="too long"):
-            reader(tmp_path / name)
+@pytest.mark.parametrize(("reader", "suffix"), [(load_onnx, ".onnx"), (read_pixels, ".tif")])
+def test_a_name_too_long_for_the_disk_is_a_sentence(
+    reader: Callable[[Path], object], suffix: str, tmp_path: Path
+) -> None:
+    with pytest.raises(BeersError, match="too long"):
+        reader(tmp_path / f"{'a' * 5000}{suffix}")
 
 
 Corrupt = Callable[[dict[str, torch.Tensor]], object]

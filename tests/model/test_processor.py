@@ -75,8 +75,10 @@ def test_under_a_real_emulator_there_is_no_name() -> None:
     assert process.stdout == "None\n"
 
 
-def test_a_system_that_does_not_state_the_name_gives_none(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("system", ["Linux", "Darwin", "Windows", "Java", ""])
+def test_a_system_that_does_not_state_the_name_gives_none(
+    system: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(processor, "COMM", NOWHERE)
-    for system in ("Linux", "Darwin", "Windows", "Java", ""):
-        monkeypatch.setattr(platform, "system", lambda system=system: system)
-        assert processor_name.__wrapped__() is None or system == platform.uname().system
+    monkeypatch.setattr(platform, "system", lambda: system)
+    assert processor_name.__wrapped__() is None or system == platform.uname().system

@@ -1,8 +1,11 @@
 """Tests that sizes behind windows, and moves of pixels, are those of onnx's own runtimes."""
 
+from collections.abc import Sequence
+from itertools import permutations, product
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from onnx import helper
@@ -50,23 +53,23 @@ def test_sizes_are_the_runtimes_own(row: Row, side: int) -> None:
     assert result.shape[1:] == shape
 
 
-RESHAPED = [[0, 6, -1], [-1, 3, 0, 10], [1, 3, 2, 20]]
-
-
-@given(st.permutations(range(4)), st.sampled_from(RESHAPED), st.sampled_from([0, 2]))
-def test_moves_are_those_of_onnx(perm: list[int], sizes: list[int], axis: int) -> None:
+@pytest.mark.parametrize(
+    ("kind", "numbers"),
+    [
+        *product(["Transpose"], permutations(range(4))),
+        *product(["Reshape"], [[0, 6, -1], [-1, 3, 0, 10], [1, 3, 2, 20]]),
+        ("Unsqueeze", [0]),
+        ("Unsqueeze", [2]),
+        ("Squeeze", [0]),
+    ],
+)
+def test_moves_are_those_of_onnx(kind: str, numbers: Sequence[int]) -> None:
     image = np.arange(120).reshape(1, 6, 4, 5)
-    for kind, attribute in {
-        "Transpose": perm,
-        "Reshape": sizes,
-        "Unsqueeze": [axis],
-        "Squeeze": [0],
-    }.items():
-        if kind == "Transpose":
-            node = helper.make_node(kind, ["x"], ["y"], perm=attribute)
-            feeds = {"x": image}
-        else:
-            node = helper.make_node(kind, ["x", "s"], ["y"])
-            feeds = {"x": image, "s": np.array(attribute)}
-        (expected,) = list(ReferenceEvaluator(node).run(None, feeds))
-        np.testing.assert_array_equal(MOVES[kind][1](image, attribute), expected)
+    feeds = {"x": image}
+    if kind == "Transpose":
+        node = helper.make_node(kind, ["x"], ["y"], perm=numbers)
+    else:
+        node = helper.make_node(kind, ["x", "s"], ["y"])
+        feeds["s"] = np.array(numbers)
+    (expected,) = list(ReferenceEvaluator(node).run(None, feeds))
+    np.testing.assert_array_equal(MOVES[kind][1](image, list(numbers)), expected)

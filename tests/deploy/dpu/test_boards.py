@@ -124,10 +124,12 @@ def test_which_boards_accept_an_operator(nodes: str, boards: set[str]) -> None:
     assert {name for name, dpu in DPUS.items() if not between_convs(nodes, dpu)} == boards
 
 
-def test_a_smaller_dpu_accepts_fewer_channels() -> None:
+@pytest.mark.parametrize(
+    ("size", "rules"), [("B512", ["conv channels"]), ("B1152", []), (None, [])]
+)
+def test_a_smaller_dpu_accepts_fewer_channels(size: str | None, rules: list[str]) -> None:
     model = written("y = Conv(image, w2049x8x1x1)")
-    for size, rules in (("B512", ["conv channels"]), ("B1152", []), (None, [])):
-        assert broken_rules(model, dpu=load_dpu("zcu102", size)) == rules
+    assert broken_rules(model, dpu=load_dpu("zcu102", size)) == rules
 
 
 @given(st.integers(1, 16), st.integers(1, 16), st.integers(1, 8192))

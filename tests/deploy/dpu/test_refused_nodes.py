@@ -114,10 +114,10 @@ def test_several_heads_are_copied_and_are_no_image() -> None:
     assert (prediction.task, prediction.refused) == ("copy", ())
 
 
-def test_results_of_few_bands_become_an_image_and_scores_do_not() -> None:
-    for channels, task in ((12, "image"), (76, "copy")):
-        nodes = f"a = {SAME}(image, w{channels}x3x3x3) y = DepthToSpace<blocksize=2>(a)"
-        assert predict_network(written(nodes, 3), DPU, 64).task == task
+@pytest.mark.parametrize(("channels", "task"), [(12, "image"), (76, "copy")])
+def test_results_of_few_bands_become_an_image_and_scores_do_not(channels: int, task: str) -> None:
+    nodes = f"a = {SAME}(image, w{channels}x3x3x3) y = DepthToSpace<blocksize=2>(a)"
+    assert predict_network(written(nodes, 3), DPU, 64).task == task
 
 
 def test_what_the_host_computes_in_float_takes_time_in_both_files() -> None:

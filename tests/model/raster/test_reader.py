@@ -148,12 +148,12 @@ def test_sidecars_place_an_image(tmp_path: Path) -> None:
         assert dict(source.raster.place.rpcs)["LINE_OFF"].startswith("9.33")
 
 
-def test_envi_is_known_by_its_header(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["a.img", "b.bsq"])
+def test_envi_is_known_by_its_header(name: str, tmp_path: Path) -> None:
     pixels = formats.digital_numbers()
-    for name in ("a.img", "b.bsq"):
-        formats.write(tmp_path / name, pixels, "ENVI")
-        with open_raster(tmp_path / name) as source:
-            assert_array_equal(source.read(3, 9), pixels[:, 3:9])
+    formats.write(tmp_path / name, pixels, "ENVI")
+    with open_raster(tmp_path / name) as source:
+        assert_array_equal(source.read(3, 9), pixels[:, 3:9])
 
 
 def test_the_header_of_another_file_makes_no_envi_of_an_erdas_image(tmp_path: Path) -> None:

@@ -70,13 +70,14 @@ def test_a_conditioned_run_changes_every_part_of_the_network(tmp_path: Path) -> 
     assert changed == dict.fromkeys(("head", "body", "body_end", "tail", "bias"), True)
 
 
-def test_plain_and_conditioned_checkpoints_are_not_taken_for_one_another(tmp_path: Path) -> None:
-    for conditioned in (False, True):
-        train(tmp_path, conditioned=conditioned)
-        with pytest.raises(ModelError, match="not a checkpoint of this network"):
-            Trainer(VARIANT, RECIPE, conditioned=not conditioned).resume(
-                tmp_path / "checkpoint.safetensors"
-            )
+@pytest.mark.parametrize("conditioned", [False, True])
+def test_plain_and_conditioned_checkpoints_are_not_taken_for_one_another(
+    conditioned: bool, tmp_path: Path
+) -> None:
+    train(tmp_path, conditioned=conditioned)
+    other = Trainer(VARIANT, RECIPE, conditioned=not conditioned)
+    with pytest.raises(ModelError, match="not a checkpoint of this network"):
+        other.resume(tmp_path / "checkpoint.safetensors")
 
 
 @pytest.mark.parametrize(

@@ -65,23 +65,23 @@ def test_the_degraded_input_gains_nothing_and_missing_figures_have_a_reason() ->
     assert "no interval: 4 sites, fewer than 5" in few.figures["PSNR"].source
 
 
-def test_errors_in_the_border_do_not_count_for_inner_pixels() -> None:
-    for height, width in ((37, 45), (300, 131)):
-        border_px = inner_border_px(height, width)
-        generator = np.random.default_rng(height)
-        clean = generator.uniform(100, 3000, (height, width)).astype(np.float32)
-        noisy = clean + generator.normal(0, 40, clean.shape).astype(np.float32)
-        inside = np.zeros((height, width), bool)
-        inside[border_px : height - border_px, border_px : width - border_px] = True
-        assert inside.sum(0).max() >= height / 2
-        restored = clean + np.where(inside, 2, 400).astype(np.float32)
-        scores = PLAIN.score(restored, NamedPair("a", clean, noisy, noise_free=clean))
-        assert scores[INNER_NOISE_FREE] == pytest.approx(20 * np.log10(4095 / 2), abs=1e-3)
-        assert scores[INNER] == pytest.approx(20 * np.log10(4095 / 40), abs=0.5)
-        whole = fidelity_db(restored, clean, clean)
-        assert whole < 30
-        assert scores[NOISE_FREE] == whole != scores["PSNR"]
-        assert scores[BIAS] == pytest.approx(200 / clean[inside].mean(), rel=1e-3)
+@pytest.mark.parametrize(("height", "width"), [(37, 45), (300, 131)])
+def test_errors_in_the_border_do_not_count_for_inner_pixels(height: int, width: int) -> None:
+    border_px = inner_border_px(height, width)
+    generator = np.random.default_rng(height)
+    clean = generator.uniform(100, 3000, (height, width)).astype(np.float32)
+    noisy = clean + generator.normal(0, 40, clean.shape).astype(np.float32)
+    inside = np.zeros((height, width), bool)
+    inside[border_px : height - border_px, border_px : width - border_px] = True
+    assert inside.sum(0).max() >= height / 2
+    restored = clean + np.where(inside, 2, 400).astype(np.float32)
+    scores = PLAIN.score(restored, NamedPair("a", clean, noisy, noise_free=clean))
+    assert scores[INNER_NOISE_FREE] == pytest.approx(20 * np.log10(4095 / 2), abs=1e-3)
+    assert scores[INNER] == pytest.approx(20 * np.log10(4095 / 40), abs=0.5)
+    whole = fidelity_db(restored, clean, clean)
+    assert whole < 30
+    assert scores[NOISE_FREE] == whole != scores["PSNR"]
+    assert scores[BIAS] == pytest.approx(200 / clean[inside].mean(), rel=1e-3)
 
 
 def test_the_border_covers_every_shipped_networks_halo_and_is_narrower_in_small_images() -> None:

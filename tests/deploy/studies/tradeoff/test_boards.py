@@ -5,6 +5,7 @@ or has the reason why not.
 from collections.abc import Sequence
 from dataclasses import replace
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -108,16 +109,21 @@ def test_a_board_that_the_budget_excludes_hides_no_other() -> None:
         assert {"PSNR", "board latency", "board power", "board energy"} <= row.figures.keys()
 
 
-def test_a_board_within_the_limits_is_compared_with_the_recommended_point() -> None:
-    points = on_boards({"fast": 1.0, "slow": 3.0}, NETWORKS)
-    for budget, point, words in (
+@pytest.mark.parametrize(
+    ("budget", "point", "words"),
+    [
         ("latency<=30s", "large", "the PSNR of the recommended point, for 3 times its board lat"),
         ("latency<=4s", "small", "PSNR -1.6 [-1.6"),
-    ):
-        row, _ = weighed(points, ["slow", "fast"], budget).board_rows
-        assert row.text["point"] == f"{point} on slow"
-        assert row.text["verdict"].startswith(words)
-        assert row.figures["board power"].value == POWER_W["slow"]
+    ],
+)
+def test_a_board_within_the_limits_is_compared_with_the_recommended_point(
+    budget: str, point: str, words: str
+) -> None:
+    points = on_boards({"fast": 1.0, "slow": 3.0}, NETWORKS)
+    row, _ = weighed(points, ["slow", "fast"], budget).board_rows
+    assert row.text["point"] == f"{point} on slow"
+    assert row.text["verdict"].startswith(words)
+    assert row.figures["board power"].value == POWER_W["slow"]
 
 
 def test_a_figure_or_network_that_a_board_lacks_is_reported_with_the_reason() -> None:
