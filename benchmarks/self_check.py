@@ -28,9 +28,9 @@ from beers_deploy.profiles.errors import BeersError
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.encodings import host_model, read_core
-from beers_deploy.restoration.method import Restore, network_method
-from beers_deploy.restoration.steps import BOTH
-from beers_deploy.studies.evaluation.methods import network_restore, profile_of
+from beers_deploy.restoration.method import Restore, network_restore
+from beers_deploy.restoration.steps import BOTH, Around
+from beers_deploy.studies.evaluation.methods import profile_of
 from beers_deploy.studies.evaluation.pairs import NamedPair, scenes_at, simulate_pairs
 from beers_deploy.studies.evaluation.sweep import conditions
 from beers_deploy.studies.stress.faults import flip_weights
@@ -146,10 +146,12 @@ def flips(images: Path, name: str, count: int) -> str:
     sensor = NOMINAL.nominal()
     reference = REFERENCE.in_units_of(sensor)
     check = SelfCheck.of(sensor, reference)
-    network = Network.load(name, sensor=profile_of(sensor, NOMINAL))
+    profile = profile_of(sensor, NOMINAL)
+    network = Network.load(name, sensor=profile)
     core = read_core(network.model)
     pairs = pairs_at(images, sensor)
-    sound = network_method(network.model, PEAK_DN, {}, sensor, reference)
+    around = Around(exposure=False)
+    sound = network_restore(network, profile, REFERENCE, around)
     known = sound(KNOWN)
     hurt_blocks = []
     losses_db = []
@@ -160,13 +162,13 @@ def flips(images: Path, name: str, count: int) -> str:
     before: dict[int, np.ndarray] = {}
     for draw in range(count):
         generator = np.random.default_rng([SEED, draw])
-        model = host_model(flip_weights(core, 1, generator), {})
+        flipped = host_model(flip_weights(core, 1, generator), {})
         number = draw % len(pairs)
         pair = pairs[number]
         assert pair.noise_free is not None  # noqa: S101 - simulated here
         if number not in before:
             before[number] = block_db(sound(pair.degraded), pair.noise_free)
-        method = network_method(model, PEAK_DN, {}, sensor, reference)
+        method = network_restore(replace(network, model=flipped), profile, REFERENCE, around)
         is_other_tile = not np.array_equal(method(KNOWN), known)
         other_tiles += is_other_tile
         restored = method(pair.degraded)

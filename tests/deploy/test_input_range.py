@@ -14,6 +14,7 @@ from torch import nn
 import beers_deploy as bd
 from beers_deploy.profiles.errors import ImageError, ModelError
 from beers_deploy.quant.encodings import read_core
+from beers_deploy.studies.evaluation.methods import method_of
 from tests.deploy.command_line import done, refused
 from tests.quant.quick import one_guess
 from tests.quant.simplify.networks import parsed
@@ -127,6 +128,21 @@ def test_restore_maps_full_scale_onto_a_stated_range() -> None:
     assert_allclose(restored, np.clip(expected, 0, 1), atol=1e-5)
     with pytest.raises(ModelError, match="Quantise it again with `input_range`"):
         bd.restore(shares, network=found, **how)
+
+
+def test_evaluate_gives_the_pixels_of_restore_in_a_stated_range() -> None:
+    """`evaluate` maps pixels onto the range that the network reads and back, as `restore` does."""
+    weight = np.random.default_rng(0).normal(0, 0.2, (1, 1, 3, 3))
+    ends = "float[N,1,H,W] x => float[N,1,H,W] y"
+    floating = parsed("y = Conv<pads=[1,1,1,1]>(x, w)", ends, constants={"w": weight})
+    given = np.random.default_rng(1).uniform(-1, 1, (4, 1, 32, 32)).astype(np.float32)
+    with one_guess():
+        int8 = bd.quantize(floating, samples=given, input_range=(-1, 1), progress=False)
+    degraded, reference = map(bd.Sensor.load, ("pleiades-degraded", "pleiades-reference"))
+    method = method_of("int8", int8, degraded, reference)
+    pixels = np.random.default_rng(2).integers(0, 4096, (32, 32)).astype(np.uint16)
+    expected = bd.restore(pixels, network=int8, sensor=degraded, force=True, progress=False)
+    assert_array_equal(method.restore(pixels.astype(np.float32)), expected)
 
 
 def test_image_files_are_samples_of_a_stated_range(tmp_path: Path) -> None:

@@ -24,10 +24,8 @@ from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.shipped import BLIND as NOT_KNOWN
-from beers_deploy.restoration.method import Restore, network_method
-from beers_deploy.restoration.plan import Plan
-from beers_deploy.restoration.steps import BOTH, Around, exposures_of
+from beers_deploy.restoration.method import Restore, network_restore
+from beers_deploy.restoration.steps import BOTH, Around
 
 logger = logging.getLogger(__name__)
 
@@ -188,41 +186,6 @@ def method_of(
     elif network.sensor == images.name:
         known = KNOWN
     return Method(name, restore, known)
-
-
-def network_restore(
-    network: Network,
-    sensor: Sensor,
-    reference: Instrument,
-    around: Around,
-    plan_of: Callable[[tuple[int, ...]], Plan] | None = None,
-    max_dn: int | None = None,
-) -> Restore:
-    """Build the function that restores an image by a network and the steps around it.
-
-    Args:
-        network: the network, float or INT8.
-        sensor: the sensor of the images. The sensor named "blind" is unknown, and the consistency
-            step is then omitted.
-        reference: the sensor that the restoration aims at.
-        around: the steps that are used: exposures, at which parts of the image are multiplied by a
-            factor before the network, and the consistency step, which makes the result agree with
-            the raw image.
-        plan_of: returns the tiles of an image, given its shape (H, W); None for the default ones.
-        max_dn: the largest digital number of the images; that of `sensor` if None.
-
-    Returns:
-        A function from degraded to restored digital numbers, (H, W) each.
-    """
-    exposures = exposures_of(network, around)
-    exposed = {factor: other.model for factor, other in exposures.items()}
-    instrument = sensor.nominal()
-    # The consistency step blurs the result as the sensor does: it needs one that is known.
-    aim = None
-    if around.consistency and sensor.name != NOT_KNOWN:
-        aim = reference.in_units_of(instrument)
-    full_scale = instrument.max_dn if max_dn is None else max_dn
-    return network_method(network.model, full_scale, exposed, instrument, aim, plan_of)
 
 
 def profile_of(sensor: Instrument, like: Sensor) -> Sensor:

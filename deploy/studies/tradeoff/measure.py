@@ -16,11 +16,11 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import sensor_names
 from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.samples.simulated import Calibration
-from beers_deploy.restoration.method import Restore
+from beers_deploy.restoration.method import Restore, network_restore
 from beers_deploy.restoration.plan import Plan, make_plan
 from beers_deploy.restoration.steps import BOTH
 from beers_deploy.restoration.tiles.exposures import tiles_by_factor
-from beers_deploy.studies.evaluation.methods import Method, network_restore
+from beers_deploy.studies.evaluation.methods import Method
 from beers_deploy.studies.evaluation.pairs import NamedPair
 from beers_deploy.studies.evaluation.scores import DETAILS, Instruments, perceptual_distances
 from beers_deploy.studies.tradeoff.points import (

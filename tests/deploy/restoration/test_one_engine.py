@@ -12,11 +12,12 @@ from numpy.testing import assert_array_equal
 import beers_deploy as bd
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration import method
+from beers_deploy.restoration.method import network_restore
 from beers_deploy.restoration.plan import Tiles, plan_for
 from beers_deploy.restoration.runtime import open_runtime
 from beers_deploy.restoration.steps import BOTH, step_for
 from beers_deploy.restoration.tiles.rows import restore_floats
-from beers_deploy.studies.evaluation.methods import method_named, network_restore
+from beers_deploy.studies.evaluation.methods import method_named
 from beers_deploy.studies.stress.networks import Runner
 from beers_deploy.studies.tradeoff.measure import tiles_of_point
 from beers_deploy.studies.tradeoff.points import FLOAT, INT8, Point, Variant
