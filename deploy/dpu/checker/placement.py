@@ -22,6 +22,7 @@ from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.operators import Broken, judge, require_known
 from beers_deploy.dpu.graph import CONVOLUTIONS, Operation, SizedGraph
 from beers_deploy.quant.domains import is_foreign
+from beers_deploy.quant.graph.ties import united
 
 Part = Literal["host-front", "dpu-core", "host-back"]
 Device = Literal["host", "DPU", "CPU"]
@@ -173,23 +174,7 @@ def place(network: SizedGraph, dpu: Dpu) -> Placement:
     for part, rules in zip(parts, broken, strict=True):
         on_core: Device = "CPU" if rules else "DPU"
         devices.append(on_core if part == "dpu-core" else "host")
-    # A subgraph is connected nodes on one device with no node of another device between them.
-    depth: dict[str, tuple[bool, int]] = {}
-    parents: dict[str, str] = {}
-    for op, device in zip(network.operations, devices, strict=True):
-        on_dpu = device == "DPU"
-        # A level counts the changes of device up to this node. Nodes after a return to the DPU
-        # have another level than those before it, so the two are never one subgraph.
-        levels = (depth[name] for name in op.inputs if name in depth)
-        steps = [changes + (was_on_dpu != on_dpu) for was_on_dpu, changes in levels]
-        level = (on_dpu, max(steps, default=0))
-        depth |= dict.fromkeys(op.outputs, level)
-        for name in (*op.outputs, *(name for name in op.inputs if depth.get(name) == level)):
-            parents[_root(parents, op.output)] = _root(parents, name)
-    numbers: dict[str, int] = {}
-    subgraphs = [
-        numbers.setdefault(_root(parents, op.output), len(numbers)) for op in network.operations
-    ]
+    subgraphs = _subgraphs(network.operations, devices)
     nodes = tuple(map(PlacedNode, network.operations, parts, devices, broken, subgraphs))
     return Placement(nodes, tuple(_cuts(network, nodes)), "" if network.quantized else FLOAT_NOTE)
 
@@ -274,11 +259,24 @@ def _is_host_back(op: Operation, network: SizedGraph, *, leads: bool) -> bool:
     )
 
 
-def _root(parents: dict[str, str], name: str) -> str:
-    """Return the tensor that represents the subgraph of `name` (union-find)."""
-    while parents.get(name, name) != name:
-        name = parents[name]
-    return name
+def _subgraphs(operations: Sequence[Operation], devices: Sequence[Device]) -> list[int]:
+    """Return the number of the subgraph of each operation: connected operations on one device with
+    none of another device between them.
+    """
+    depth: dict[str, tuple[bool, int]] = {}
+    links: list[list[str]] = []
+    for op, device in zip(operations, devices, strict=True):
+        on_dpu = device == "DPU"
+        # A level counts the changes of device up to this node. Nodes after a return to the DPU
+        # have another level than those before it, so the two are never one subgraph.
+        levels = (depth[name] for name in op.inputs if name in depth)
+        steps = [changes + (was_on_dpu != on_dpu) for was_on_dpu, changes in levels]
+        level = (on_dpu, max(steps, default=0))
+        depth |= dict.fromkeys(op.outputs, level)
+        links.append([*op.outputs, *(name for name in op.inputs if depth.get(name) == level)])
+    first = united(links)
+    numbers: dict[str, int] = {}
+    return [numbers.setdefault(first[op.output], len(numbers)) for op in operations]
 
 
 def _cuts(network: SizedGraph, nodes: Iterable[PlacedNode]) -> Iterable[Cut]:
