@@ -149,7 +149,7 @@ def evaluate(
     from beers_deploy.studies.evaluation.calibrate import calibrate_network, network_to_calibrate
     from beers_deploy.studies.evaluation.compression import check_rates
     from beers_deploy.studies.evaluation.pairs import check_brightness
-    from beers_deploy.studies.evaluation.run import Plan, run_evaluation
+    from beers_deploy.studies.evaluation.run import run_evaluation
 
     stored, in_memory = _stored_or_given(pairs)
     named = named_methods(methods)
@@ -160,7 +160,8 @@ def evaluate(
         rates = check_rates(
             numbers_of("bits_per_pixel", bits_per_pixel, "1,2,3"), sensors[0].nominal().bits
         )
-    plan = Plan(
+    source = None if calibrate is None else network_to_calibrate(named, Path(calibrate))
+    table = run_evaluation(
         methods=named,
         sensors=sensors,
         scenes=path_or_none(images),
@@ -174,8 +175,6 @@ def evaluate(
         around=Around(consistency, exposure),
         seed=seed,
     )
-    source = None if calibrate is None else network_to_calibrate(plan.methods, Path(calibrate))
-    table = run_evaluation(plan)
     if source is not None and calibrate is not None:
         calibrate_network(table, *source, Path(calibrate))
     if folder is not None:

@@ -85,11 +85,24 @@ class Evaluation(Table):
         return page
 
 
-@dataclass(frozen=True)
-class Plan:
-    """The checked options of `evaluate`.
+def run_evaluation(
+    *,
+    methods: Mapping[str, NetworkLike | Restore],
+    sensors: tuple[Sensor, Sensor],
+    scenes: Path | None,
+    folder: Path | None,
+    given: Sequence[Pair] | None,
+    lpips: Path | None,
+    factors: Sequence[float],
+    rates: Sequence[float],
+    sweep: bool,
+    strict: bool,
+    around: Around,
+    seed: int,
+) -> Evaluation:
+    """Compare methods on the same pairs, and on targets whose truth is known.
 
-    Attributes:
+    Args:
         methods: the compared methods by the name of their row: a name, a network, or a function
             from degraded to restored digital numbers (H, W).
         sensors: the sensors of the degraded and of the reference images.
@@ -103,83 +116,60 @@ class Plan:
         strict: True to refuse stored pairs that contradict the sensor.
         around: the steps around networks that are used: exposures and the consistency step.
         seed: the seed of every random draw.
-    """
-
-    methods: Mapping[str, NetworkLike | Restore]
-    sensors: tuple[Sensor, Sensor]
-    scenes: Path | None
-    folder: Path | None
-    given: Sequence[Pair] | None
-    lpips: Path | None
-    factors: Sequence[float]
-    rates: Sequence[float]
-    sweep: bool
-    strict: bool
-    around: Around
-    seed: int
-
-
-def run_evaluation(plan: Plan) -> Evaluation:
-    """Compare methods on the same pairs, and on targets whose truth is known.
-
-    Args:
-        plan: the checked options of `evaluate`.
 
     Raises:
         BeersError: a method, an image or weights cannot be loaded, or stored pairs contradict the
             sensor and the option `strict` is set.
     """
-    sensors = plan.sensors
-    seed = plan.seed
-    methods = [_method(name, source, sensors, plan.around) for name, source in plan.methods.items()]
+    compared = [_method(name, source, sensors, around) for name, source in methods.items()]
     nominal = sensors[0].nominal()
-    distances = scores.perceptual_distances(plan.lpips)
+    distances = scores.perceptual_distances(lpips)
     instruments = scores.Instruments(distances, nominal.max_dn, nominal.offset_dn)
     remarks = list[str]()
     sensor_rows = list[Row]()
     loaded = list[NamedPair]()
-    if plan.given is not None:
-        for number, pair in enumerate(plan.given):
+    if given is not None:
+        for number, pair in enumerate(given):
             degraded, reference = (image.astype(np.float32) for image in pair)
             loaded.append(NamedPair(f"pair{number}", degraded, reference, noise_free=pair.clean))
         if not loaded:
             raise OptionError("There are no `pairs`. Give at least one.")
-    elif plan.folder is not None:
-        loaded = read_pairs(plan.folder, nominal.max_dn, read_pairs_recipe(plan.folder))
-        sensor_rows = [_sensor_row(loaded, sensors[0], str(plan.folder), plan.strict)]
+    elif folder is not None:
+        loaded = read_pairs(folder, nominal.max_dn, read_pairs_recipe(folder))
+        sensor_rows = [_sensor_row(loaded, sensors[0], str(folder), strict)]
     else:
-        loaded, remarks = pairs_of_scenes(plan.scenes, *sensors, seed)
-    rows = _compared(methods, loaded, sensors, instruments, seed)
-    for factor in plan.factors[1:]:
-        dimmed, _ = pairs_of_scenes(plan.scenes, *sensors, seed, factor)
-        for method in methods:
+        loaded, remarks = pairs_of_scenes(scenes, *sensors, seed)
+    rows = _compared(compared, loaded, sensors, instruments, seed)
+    for factor in factors[1:]:
+        dimmed, _ = pairs_of_scenes(scenes, *sensors, seed, factor)
+        for method in compared:
             scored = scores.score(method, dimmed, instruments, seed)
             rows += [replace(row, table=table_at(factor, row.table)) for row in scored]
-    rates = compression.run_compression(methods, loaded, nominal, plan.rates, seed)
+    compressed = compression.run_compression(compared, loaded, nominal, rates, seed)
     swept = list[Row]()
-    for factor in plan.factors if plan.sweep else ():
-        swept += run_sweep(methods, plan.scenes, *sensors, seed, factor).rows
+    for factor in factors if sweep else ():
+        swept += run_sweep(compared, scenes, *sensors, seed, factor).rows
     # Images of one site resemble one another: sites are counted, not images.
     few = too_few(len({pair.site for pair in loaded}))
     notes = [note for note in (few, scores.inner_note(loaded), *remarks) if note]
     names = f"{sensors[0].name} -> {sensors[1].name}"
-    every = (*_in_order([*rows, *scores.paper_rows()]), *sensor_rows, *rates, *swept)
+    every = (*_in_order([*rows, *scores.paper_rows()]), *sensor_rows, *compressed, *swept)
     return Evaluation(
         title=f"{names}, {counted(len(loaded), 'image')}",
         arguments={
             "sensor": sensors[0].name,
             "reference": sensors[1].name,
-            "methods": ",".join(plan.methods),
-            "brightness": ",".join(f"{factor:g}" for factor in plan.factors),
+            "methods": ",".join(methods),
+            "brightness": ",".join(f"{factor:g}" for factor in factors),
         },
-        inputs=tuple(_inputs(plan)),
+        inputs=tuple(_inputs(methods, lpips, scenes, folder)),
         rows=every,
         notes=tuple(notes),
         headings=HEADINGS,
         # Single images are for the document alone.
         details=frozenset({row.table for row in every if row.table.startswith("images")} | WORDY),
         sensors=sensors,
-        methods=methods,
+        methods=compared,
         pairs=loaded,
     )
 
@@ -225,9 +215,14 @@ def _sensor_row(pairs: Sequence[NamedPair], sensor: Sensor, name: str, strict: b
     return Row("sensor of the degraded images", sensor.name, check.figures, check.text)
 
 
-def _inputs(plan: Plan) -> Iterator[Path | Input]:
+def _inputs(
+    methods: Mapping[str, NetworkLike | Restore],
+    lpips: Path | None,
+    scenes: Path | None,
+    folder: Path | None,
+) -> Iterator[Path | Input]:
     """Yield the inputs of the figures: networks, weights of LPIPS, scenes or pairs."""
-    for source in plan.methods.values():
+    for source in methods.values():
         if isinstance(source, Network):
             yield source.input
         elif isinstance(source, str | os.PathLike):
@@ -235,11 +230,11 @@ def _inputs(plan: Plan) -> Iterator[Path | Input]:
             file = Path(os.fspath(source).partition("@")[0])
             if file.is_file():
                 yield file
-    if plan.lpips is not None and plan.lpips.is_file():
-        yield plan.lpips
-    folders = [plan.scenes] if plan.scenes else []
-    if plan.folder:
-        folders = [plan.folder / "degraded", plan.folder / "reference"]
+    if lpips is not None and lpips.is_file():
+        yield lpips
+    folders = [scenes] if scenes else []
+    if folder:
+        folders = [folder / "degraded", folder / "reference"]
     yield from chain.from_iterable(map(list_images, folders))
 
 
