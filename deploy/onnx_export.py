@@ -125,7 +125,7 @@ def export_int8(
     tile: int | None,
     core_file: Path | None,
     target: TargetProfile,
-    c_file: Path | None = None,
+    c_file: Path | None,
 ) -> None:
     """Write an INT8 network for onnxruntime, and on request its integer core for a board or as C.
 

@@ -27,7 +27,7 @@ That is more than the order of sums in float32 explains.
 """
 
 
-def torch_network(path: Path, sensor: Instrument | None = None) -> ConvBEERS | OfOneSensor:
+def torch_network(path: Path, sensor: Instrument | None) -> ConvBEERS | OfOneSensor:
     """Load weights as a torch network, to compare an exported ONNX model with it.
 
     Args:

@@ -158,7 +158,7 @@ def quantize_alone(
     target: TargetProfile,
     steps: int | None,
     effort: Effort,
-    adapts: bool = False,
+    adapts: bool,
 ) -> Network:
     """Quantise a network that is not conditioned on a sensor, or for its present sensor only.
 
@@ -309,7 +309,7 @@ def rounding_of(int8: Path, weights: Path) -> "Rounding":
 
 def family_model(
     network: Conditioned,
-    images: Sequence[Path] = (),
+    images: Sequence[Path],
     seed: int = 0,
     shifts: Shifts = SHIFTS,
     effort: Effort = Effort.normal,

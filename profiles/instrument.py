@@ -151,7 +151,7 @@ def with_offset_of(others: Mapping[str, E], own: Mapping[str, E]) -> dict[str, E
     }
 
 
-def mtf_limit(antialias_sigma_px: float = 0.0) -> float:
+def mtf_limit(antialias_sigma_px: float) -> float:
     """Return the highest possible MTF at Nyquist: 2 / pi (a perfect lens over a square detector)
     times the gain of the anti-alias filter.
 

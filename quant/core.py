@@ -301,9 +301,7 @@ def _quantize_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts) -> IntCo
     )
 
 
-def quantize_bias(
-    bias: np.ndarray, product: int, shifts: Shifts = SHIFTS
-) -> tuple[np.ndarray, int]:
+def quantize_bias(bias: np.ndarray, product: int, shifts: Shifts) -> tuple[np.ndarray, int]:
     """Quantise a convolution's bias to int8, at a scale that a shift can align with the
     accumulator.
 

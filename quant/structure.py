@@ -11,7 +11,7 @@ silently.
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
@@ -65,7 +65,7 @@ class Rounded:
     name: str
     scale: Scale
     low_is_relu: bool
-    counted: slice = field(default_factory=lambda: slice(None))
+    counted: slice
 
     @property
     def lowest(self) -> int:

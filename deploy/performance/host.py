@@ -69,7 +69,7 @@ def host_rows(
     network: NetworkLike,
     target: TargetProfile,
     tile_px: int,
-    threads: int = 0,
+    threads: int,
     sensor: Sensor | None = None,
 ) -> list[Row]:
     """Time a network for one tile on this machine, next to its counterpart in the other precision.

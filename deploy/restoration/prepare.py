@@ -230,7 +230,7 @@ class NetworkPipeline:
     """
 
     networks: Mapping[str, Network]
-    tiles: Tiles = Tiles()  # noqa: RUF009 - frozen
+    tiles: Tiles
     engine: Engine = Engine()  # noqa: RUF009 - frozen
     around: Around = Around()  # noqa: RUF009 - frozen
 

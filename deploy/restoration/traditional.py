@@ -168,7 +168,7 @@ class TraditionalMethod:
         quality: 'fast', 'standard' or 'best', from quick to thorough.
     """
 
-    quality: str = "standard"
+    quality: str
 
     @property
     def engine(self) -> Engine:

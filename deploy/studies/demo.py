@@ -12,7 +12,7 @@ from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.pictures import busiest_windows, picture_url, stretch_of, strip
 from beers_deploy.model.metrics.fidelity import fidelity_db, ssim
 from beers_deploy.model.raster.images import read_acquisition, read_pixels
-from beers_deploy.model.shipped import SENSOR, VARIANT
+from beers_deploy.model.shipped import VARIANT
 from beers_deploy.model.simulator.acquire import MARGIN_PX, Pair, simulate_pair
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
@@ -87,7 +87,7 @@ def quality_rows(images: Mapping[str, np.ndarray], pair: Pair, degraded: np.ndar
     return rows
 
 
-def load_sensors(sensor: SensorLike = SENSOR) -> tuple[Sensor, Sensor]:
+def load_sensors(sensor: SensorLike) -> tuple[Sensor, Sensor]:
     """Load the sensor that the demonstration simulates, and the reference sensor it restores to.
 
     Args:

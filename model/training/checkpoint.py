@@ -162,7 +162,7 @@ def checkpoint_sha256(tensors: Mapping[str, Tensor], header: Mapping[str, object
 
 
 def read_checkpoint(
-    path: Path, network: Network, recipe: TrainingRecipe, data: str = ""
+    path: Path, network: Network, recipe: TrainingRecipe, data: str
 ) -> tuple[dict[str, Tensor], int, Guards]:
     """Read and validate a checkpoint, or raise ModelError.
 

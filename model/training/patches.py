@@ -34,7 +34,7 @@ class PatchRecipe:
 
     degraded: Sensor
     reference: Sensor
-    patch_px: int = 96
+    patch_px: int
     oversamplings: tuple[int, ...] = (2, 3, 4, 5)
     looks: Looks = ORDINARY
     margin_px: int = 16

@@ -42,11 +42,11 @@ class HostEnd:
     """
 
     replaced: dict[str, str]
-    crop_px: int = 0
-    limits: tuple[float, ...] = ()
-    base: Base | None = None
-    activation: str = ""
-    adds_in_core: bool = False
+    crop_px: int
+    limits: tuple[float, ...]
+    base: Base | None
+    activation: str
+    adds_in_core: bool
 
     def in_core(self, name: str) -> str:
         """Return the name of the tensor that takes a tensor's place in the core."""

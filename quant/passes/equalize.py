@@ -145,7 +145,7 @@ def channel_sizes(
     graph: Graph,
     names: list[str],
     images: Iterable[np.ndarray],
-    host_part: HostPart = ONE_CHANNEL,
+    host_part: HostPart,
     quantile: float = QUANTILE,
 ) -> Iterator[list[np.ndarray]]:
     """Yield, for every tile of the images, a quantile of the absolute values of each channel.

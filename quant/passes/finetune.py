@@ -102,7 +102,7 @@ class Tuning:
     """
 
     pairs: Sequence[Pair]
-    steps: int | None = None
+    steps: int | None
     rate: float = 0.3
     seed: int = 0
     original: onnx.ModelProto | None = None

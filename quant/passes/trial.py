@@ -92,7 +92,7 @@ def search_targets(
     host_part: HostPart,
     images: Sequence[np.ndarray],
     count: int,
-    brightens: bool = False,
+    brightens: bool,
 ) -> list[Target]:
     """Choose crops of the images for a search, and restore them in float.
 

@@ -94,7 +94,7 @@ def sample_files(path: Path) -> list[Path]:
 
 
 def stored_samples(
-    source: Path | Sequence[Pair], ranges: Ranges = ()
+    source: Path | Sequence[Pair], ranges: Ranges
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Read stored samples one after the other.
 

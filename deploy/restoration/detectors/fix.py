@@ -245,7 +245,7 @@ class FixedSource:
 
 
 def replace_pixels(
-    plane: np.ndarray, bad: np.ndarray, valid: np.ndarray, nodata: float | None = None
+    plane: np.ndarray, bad: np.ndarray, valid: np.ndarray, nodata: float | None
 ) -> None:
     """Replace faulty pixels of one band in place, by interpolation between valid neighbours.
 

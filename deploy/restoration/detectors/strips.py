@@ -200,9 +200,7 @@ NAMED = 3
 """The largest number of places that a sentence names."""
 
 
-def warn_of_detectors(
-    source: Source, full_scale: float, advise_fix: bool = True
-) -> Mapping[str, Figure]:
+def warn_of_detectors(source: Source, full_scale: float, advise_fix: bool) -> Mapping[str, Figure]:
     """Detect faults of detectors in strips of an image, and log a warning for each kind of fault.
 
     Args:

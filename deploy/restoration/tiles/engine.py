@@ -55,8 +55,8 @@ class Strip:
     top: int
     pixels: np.ndarray
     missing: np.ndarray | None
-    above: bool = False
-    left: int = 0
+    above: bool
+    left: int
 
 
 @dataclass(frozen=True)

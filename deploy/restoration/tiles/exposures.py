@@ -90,7 +90,7 @@ class ExposedNetwork:
 
 
 def tiles_by_factor(
-    image: np.ndarray, plan: Plan, factors: Sequence[float], full_scale: float, offset: float = 0.0
+    image: np.ndarray, plan: Plan, factors: Sequence[float], full_scale: float, offset: float
 ) -> dict[float, int]:
     """Count the tiles of an image that need each exposure, the factor by which pixels are
     multiplied before the network.

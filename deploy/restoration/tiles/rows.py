@@ -74,7 +74,7 @@ class HeldRows:
         parts: pixels (bands, rows, width) of adjacent rows of tiles, from the top.
     """
 
-    top: int = 0
+    top: int
     parts: deque[np.ndarray] = field(default_factory=deque)
 
     @property

@@ -280,7 +280,7 @@ def mean_known(values: np.ndarray) -> np.ndarray:
 
 
 def precisions(
-    hits: Hits, kind: int, weights: np.ndarray, size: int = ALL, levels: int = 1
+    hits: Hits, kind: int, weights: np.ndarray, size: int, levels: int = 1
 ) -> np.ndarray:
     """Compute the precision of one class at each of `RECALLS`: the best precision at this recall or
     a higher one, as COCO defines it.

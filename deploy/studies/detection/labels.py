@@ -61,7 +61,7 @@ class _File(NamedTuple):
     image: Path
     source: Path
     boxes: list[Box]
-    size_px: tuple[float, float] = (0, 0)
+    size_px: tuple[float, float]
 
 
 def read_labelled(

@@ -174,7 +174,7 @@ def run_study(
     methods: Sequence[str],
     *,
     reference: SensorLike | None = None,
-    seed: int = 0,
+    seed: int,
 ) -> list[Comparison]:
     """Measure how well a detector finds objects on reference, degraded and restored images of the
     same scenes.
@@ -233,8 +233,8 @@ def labelled_scenes(
     names: Sequence[str],
     mapping: Mapping[str, str],
     images: Path,
-    labels: Path | None = None,
-    split: str | None = None,
+    labels: Path | None,
+    split: str | None,
 ) -> tuple[list[LabelledScene], list[str]]:
     """Read the labels of a folder of pictures, and return the pictures as scenes, whose pixels are
     read on demand.

@@ -152,7 +152,7 @@ class Subject:
 
 
 def open_subject(
-    float_network: NetworkLike | None = None,
+    float_network: NetworkLike | None,
     int8_network: NetworkLike | None = None,
     sensor: SensorLike = SENSOR,
 ) -> Subject:
