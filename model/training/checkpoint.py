@@ -19,7 +19,7 @@ from beers_deploy.model.convbeers import Network, arrays, for_sensor, save_netwo
 from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.tensors import all_finite, read_tensors
 from beers_deploy.model.training.losses import PAPER, LossWeights
-from beers_deploy.profiles.errors import ModelError, OptionError, printable
+from beers_deploy.profiles.errors import ModelError, printable
 
 
 @dataclass(frozen=True)
@@ -50,17 +50,6 @@ class TrainingRecipe:
     loss: LossWeights = PAPER
     seed: int = 0
     rounding: str = ""
-
-    def __post_init__(self) -> None:
-        numbers = {"learning rate": self.learning_rate}
-        numbers |= {
-            f"weight of {term} in the loss": weight for term, weight in asdict(self.loss).items()
-        }
-        for name, value in numbers.items():
-            if not (math.isfinite(value) and value >= 0):
-                raise OptionError(
-                    f"The {name} must be a finite number of 0 or more, got {value:g}."
-                )
 
     def rate_at(self, step: int) -> float:
         """Return the learning rate of a step: a linear warm-up, then a cosine down to zero."""
