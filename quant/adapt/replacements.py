@@ -149,7 +149,7 @@ def _clipped_line(graph: OnnxGraph, node: Node) -> list[Node]:
     scaled = _times(graph, node.inputs[0], np.array([3 * TANH_SLOPE]), f"{output}.scaled")
     return [
         scaled,
-        Node.new("Add", [scaled.outputs[0], three], shifted, shifted),
+        Node.new("Add", [scaled.outputs[0], three], shifted),
         Node.new("Clip", [shifted, zero, six], clipped, node.name),
         _times(graph, clipped, np.array([1 / 3]), shrunk),
         Node.new("Add", [shrunk, minus_one], output, f"{output}.lowered"),
@@ -181,14 +181,13 @@ def _cubic_convolution(graph: OnnxGraph, node: Node) -> list[Node]:
         "ConvTranspose",
         [mirrored, names[1]],
         convolved,
-        convolved,
         kernel_shape=list(weight.shape[2:]),
         strides=[factor] * 2,
         # The pads crop the results of the mirrored border.
         pads=[base.kernel_pad + REACH_PX * factor] * 4,
     )
     return [
-        Node.new("Pad", [image, names[0]], mirrored, mirrored, mode="reflect"),
+        Node.new("Pad", [image, names[0]], mirrored, mode="reflect"),
         convolution,
         node,
     ]
@@ -202,7 +201,7 @@ def _scaled_hard_sigmoid(graph: OnnxGraph, node: Node) -> list[Node]:
     scaled = _times(graph, node.inputs[0], np.array([6 * slope]), f"{output}.scaled")
     # With z = 6 (slope x + offset - 0.5), clip(z / 6 + 0.5, 0, 1) is the original function.
     shift = graph.add_constant(f"{output}.offset", np.array(6 * (offset - 0.5)))
-    shifted = Node.new("Add", [scaled.outputs[0], shift], f"{output}.shifted", f"{output}.shifted")
+    shifted = Node.new("Add", [scaled.outputs[0], shift], f"{output}.shifted")
     hard = Node.new("HardSigmoid", shifted.outputs, output, node.name, alpha=1 / 6, beta=0.5)
     return [scaled, shifted, hard]
 
@@ -234,12 +233,12 @@ def _two_branches(graph: OnnxGraph, node: Node) -> list[Node]:
         nodes.append(twin)
     straight = _times(graph, source, signs * slopes, f"{output}.straight")
     scaled = _times(graph, bent_source, np.abs(1 - slopes), f"{output}.scaled")
-    bent = Node.new("Relu", scaled.outputs, f"{output}.bent", f"{output}.bent")
+    bent = Node.new("Relu", scaled.outputs, f"{output}.bent")
     names = [straight.outputs[0], bent.outputs[0]]
     nodes += [straight, scaled, bent]
     if (signs > 0).all():
         return [*nodes, Node.new("Add", names, output, node.name)]
-    negated = Node.new("Add", names, f"{output}.negated", f"{output}.negated")
+    negated = Node.new("Add", names, f"{output}.negated")
     return [*nodes, negated, _times(graph, negated.outputs[0], signs, output)]
 
 
@@ -254,4 +253,4 @@ def _times(graph: OnnxGraph, source: str, factors: np.ndarray, output: str) -> N
     """
     shape = (1, -1, 1, 1) if factors.size > 1 else ()
     constant = graph.add_constant(f"{output}.factor", factors.reshape(shape))
-    return Node.new("Mul", [source, constant], output, output)
+    return Node.new("Mul", [source, constant], output)

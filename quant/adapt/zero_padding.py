@@ -72,7 +72,7 @@ def pad_by_zeros(model: onnx.ModelProto) -> None:
     pads_name = constant(f"{mirrored}.pads", [0, 0, border_px, border_px] * 2)
     ends = [[crop_px] * 2, [-crop_px] * 2, [2, 3]]
     places = [constant(f"{whole}.{k}", numbers) for k, numbers in enumerate(ends)]
-    pad = Node.new("Pad", [image, pads_name], mirrored, mirrored, mode="reflect")
+    pad = Node.new("Pad", [image, pads_name], mirrored, mode="reflect")
     crop = Node.new("Slice", [whole, *places], result, f"{result}.cropped")
     graph.set_nodes([pad, *graph.nodes, crop])
     graph.save()

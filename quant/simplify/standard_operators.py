@@ -69,11 +69,11 @@ def split_soft_threshold(graph: OnnxGraph, node: Node) -> list[Node] | None:
     parts = [f"{node.result}.{part}" for part in ("negative", "above", "below", "more", "less")]
     negative, above, below, more, less = parts
     return [
-        Node.new("Neg", [source], negative, negative),
-        Node.new("Sub", [source, difference.inputs[1]], above, above),
-        Node.new("Sub", [negative, difference.inputs[1]], below, below),
-        Node.new("Relu", [above], more, more),
-        Node.new("Relu", [below], less, less),
+        Node.new("Neg", [source], negative),
+        Node.new("Sub", [source, difference.inputs[1]], above),
+        Node.new("Sub", [negative, difference.inputs[1]], below),
+        Node.new("Relu", [above], more),
+        Node.new("Relu", [below], less),
         node.replaced_by("Sub", [more, less]),
     ]
 
@@ -301,7 +301,7 @@ def pool_maximum(graph: OnnxGraph, node: Node) -> list[Node] | None:
         larger = result if half == 1 else f"{result}.{half}"
         nodes += [
             graph.convolution(source, difference, difference, (first - second)[..., None, None]),
-            Node.new("Relu", [difference], limited, limited),
+            Node.new("Relu", [difference], limited),
             graph.convolution(source, other, other, second[..., None, None]),
             Node.new("Add", [other, limited], larger, node.name if half == 1 else larger),
         ]
