@@ -12,6 +12,7 @@ import pytest
 from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.restoration.plan import make_plan
+from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 from beers_deploy.restoration.tiles.rows import restore_floats
 from beers_deploy.studies.stress.battery import StageResult, run_battery, worst
 from beers_deploy.studies.stress.cases import CASES, FULL_DN, Case
@@ -123,9 +124,10 @@ def test_a_halo_one_pixel_short_fails(subject: Subject) -> None:
     image = BY_NAME["no noise"].draw(48, np.random.default_rng(0))[0]
     radius_px = subject.float32.tiling.halo_px
     at_once = subject.float32.restore(image)
+    network = ExposedNetwork({1: subject.float32.infer()})
     for halo_px, same in ((radius_px, True), (radius_px - 1, False)):
         plan = make_plan((1, *image.shape), 2 * radius_px + 9, halo_px, Tiling(halo_px))
-        tiled = restore_floats(image, subject.float32.infer(), plan, FULL_DN)
+        tiled = restore_floats(image, network, plan, FULL_DN)
         assert differing("plans differ", tiled, at_once).holds == same
 
 

@@ -22,11 +22,9 @@ from beers_deploy.model.consistency.step import Consistency
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.source import ArraySource, Source
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.untrusted import times
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Plan, Span, TilePlace
-from beers_deploy.restoration.runtime import Infer
 from beers_deploy.restoration.tiles.engine import Restorer, Strip, Tile
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 
@@ -266,9 +264,9 @@ def gathered(
 
 def restore_floats(
     dn: np.ndarray,
-    network: Infer | ExposedNetwork,
+    network: ExposedNetwork,
     plan: Plan,
-    max_dn: float = MAX_DN,
+    max_dn: float,
     consistency: Steps = (),
 ) -> np.ndarray:
     """Restore an image of one band in memory, to floats that are not rounded.
@@ -277,10 +275,9 @@ def restore_floats(
 
     Args:
         dn: digital numbers (H, W) of 0 to `max_dn`. NaN is a missing pixel, and stays NaN.
-        network: a function that runs the network, or an `ExposedNetwork`, which has further
-            versions of it for dark pixels.
+        network: the network, perhaps with further versions of it for dark pixels.
         plan: how the image is cut into tiles.
-        max_dn: the largest digital number, which is 1.0 to the network; by default that of 12 bits.
+        max_dn: the largest digital number, which is 1.0 to the network.
         consistency: the step that makes the result agree with the raw image at low spatial
             frequencies, as a tuple of one; empty to omit it.
 
@@ -299,8 +296,7 @@ def restore_floats(
     pixels = np.asarray(dn, np.float32)[None]
     _, height_px, width_px = pixels.shape
     raster = Raster(1, height_px, width_px, pixels.dtype)
-    exposed = network if isinstance(network, ExposedNetwork) else ExposedNetwork({1: network})
-    restorer = Restorer(raster, (exposed,), float(max_dn), plan, consistency=consistency)
+    restorer = Restorer(raster, (network,), float(max_dn), plan, consistency=consistency)
     rows = restore_rows(ArraySource(pixels, raster), restorer, plan.rows, lambda: None)
     restored, _ = gathered(rows, plan.out_shape, raster.out_dtype)
     return np.asarray(restored[0])

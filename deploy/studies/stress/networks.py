@@ -35,6 +35,7 @@ from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.receptive_field import Tiling, tiling_of
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.runtime import Infer
+from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 from beers_deploy.restoration.tiles.rows import restore_floats
 from beers_deploy.results import Input
 from beers_deploy.studies.stress.cases import FULL_DN
@@ -94,7 +95,8 @@ class Runner:
             ImageError: a pixel is infinite or outside 12 bits.
         """
         plan = make_plan((1, *image.shape), tile_px, self.tiling.halo_px, self.tiling)
-        return restore_floats(image, self.infer(threads), plan, FULL_DN)
+        network = ExposedNetwork({1: self.infer(threads)})
+        return restore_floats(image, network, plan, FULL_DN)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from beers_deploy.restoration.method import network_restore
 from beers_deploy.restoration.plan import Tiles, plan_for
 from beers_deploy.restoration.runtime import open_runtime
 from beers_deploy.restoration.steps import BOTH, step_for
+from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 from beers_deploy.restoration.tiles.rows import restore_floats
 from beers_deploy.studies.evaluation.methods import method_named
 from beers_deploy.studies.stress.networks import Runner
@@ -62,6 +63,7 @@ def ways(path: Path, tile_px: int, halo_px: int) -> Mapping[str, Restored]:
     point = Point(variant, tile_px=tile_px, halo_px=halo_px)
     plan = plan_for(network, (1, *ODD), Tiles(tile_px, str(halo_px)))
     infer, _ = open_runtime("onnxruntime", network.model, threads=0)
+    engine = ExposedNetwork({1: infer})
     steps = (step_for(SENSOR, 4095),)
     return {
         "the library and the demo": partial(
@@ -70,7 +72,7 @@ def ways(path: Path, tile_px: int, halo_px: int) -> Mapping[str, Restored]:
         "tradeoff": network_restore(
             network, SENSOR, REFERENCE.nominal(), BOTH, partial(tiles_of_point, point)
         ),
-        "the engine": lambda dn: restore_floats(dn, infer, plan, consistency=steps),
+        "the engine": lambda dn: restore_floats(dn, engine, plan, 4095, steps),
     }
 
 
