@@ -14,6 +14,7 @@ A gate that fails is no error: its command exits with 1.
 """
 
 import os
+from collections.abc import Iterable
 from importlib import import_module
 from pathlib import Path
 from traceback import walk_tb
@@ -137,6 +138,15 @@ def as_path(value: str | os.PathLike[str]) -> Path:
     if not isinstance(value, str | os.PathLike):
         raise OptionError(f"The output must be a path, got {printable(repr(value))}. Name it.")
     return Path(value)
+
+
+def listed(value: Any) -> list[Any]:
+    """Return the values of an option that may have several: text with commas between them, a
+    sequence, or a single value.
+    """
+    if isinstance(value, str):
+        return [part.strip() for part in value.split(",")]
+    return list(value) if isinstance(value, Iterable) else [value]
 
 
 def require_numbers(name: str, value: object) -> None:

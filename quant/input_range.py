@@ -9,7 +9,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from beers_deploy.profiles.errors import OptionError, printable
+from beers_deploy.profiles.errors import OptionError, listed, printable
 
 Ranges = tuple[tuple[float, float], ...]
 """(low, high) of each channel of the image; empty if all are in [0, 1]."""
@@ -49,8 +49,7 @@ def read_ranges(option: object, channels: int) -> Ranges:
         OptionError: the option has another form or another number of pairs, or a pair is no range.
     """
     try:
-        numbers = option.split(",") if isinstance(option, str) else np.ravel(option)  # type: ignore[call-overload]
-        pairs = np.array(numbers, float).reshape(-1, 2)
+        pairs = np.array(listed(option), float).reshape(-1, 2)
         if len(pairs) not in (1, channels):
             raise ValueError(f"{len(pairs)} pairs")
         ranges = tuple((float(low), float(high)) for low, high in pairs)

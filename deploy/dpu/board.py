@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from beers_deploy.profiles.constant import Constant
-from beers_deploy.profiles.errors import OptionError, ProfileError, printable
+from beers_deploy.profiles.errors import OptionError, ProfileError, listed, printable
 from beers_deploy.profiles.shipped import MODEL_SUFFIX, board_names
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.profiles.target_limits import LIMITS
@@ -32,15 +32,8 @@ def boards_of(board: BoardLike | Sequence[BoardLike]) -> list[TargetProfile]:
     Raises:
         ProfileError: there is no such board, or its file is not valid.
     """
-    sources: Sequence[BoardLike]
-    if isinstance(board, str):
-        every = board.removesuffix(MODEL_SUFFIX) == ALL
-        sources = board_names() if every else [name.strip() for name in board.split(",")]
-    elif isinstance(board, Sequence):
-        sources = board
-    else:
-        # Anything that is not a board is refused when it is loaded.
-        sources = [board]
+    every = isinstance(board, str) and board.removesuffix(MODEL_SUFFIX) == ALL
+    sources = board_names() if every else listed(board)
     if not sources:
         raise OptionError("`target` names no board. Give a name, a .toml file, or all.")
     return list(map(TargetProfile.load, sources))

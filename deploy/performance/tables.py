@@ -6,7 +6,8 @@ predicted, and the paper's figures.
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import product
 
 from beers_deploy.dpu.board import Dpu
@@ -30,7 +31,7 @@ from beers_deploy.performance.swath import (
     swath_latency,
     throughput,
 )
-from beers_deploy.profiles.errors import OptionError, counted, printable
+from beers_deploy.profiles.errors import OptionError, counted, listed, printable
 from beers_deploy.profiles.figures import Figure, Row, number, predicted, published, unavailable
 from beers_deploy.profiles.target import TargetProfile
 
@@ -281,12 +282,7 @@ def parse_tiles(tile: int | str | Sequence[int]) -> list[int]:
     Raises:
         OptionError: a side is not an integer from 16 to MOST_TILE_PX.
     """
-    parts: Iterable[object] = [tile]
-    if isinstance(tile, str):
-        parts = tile.split(",")
-    elif isinstance(tile, Iterable):
-        parts = tile
-    sides = [str(part).strip() for part in parts]
+    sides = [str(part).strip() for part in listed(tile)]
     # Python raises an error of its own for very long numbers, so these are refused by their length.
     if not sides or not all(
         side.isdecimal() and len(side) < 6 and 16 <= int(side) <= MOST_TILE_PX for side in sides

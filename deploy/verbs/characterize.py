@@ -4,7 +4,7 @@ import logging
 import math
 from typing import TYPE_CHECKING, Annotated, Any
 
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError, listed
 from beers_deploy.verbs.parameters import Edges, Images, Interval, Mtf, Progress, RequiredFile
 from beers_deploy.verbs.verb import path_or_none, refuse_with, verb
 
@@ -88,13 +88,13 @@ def contrasts(mtf: Any) -> tuple[float, float]:
     from beers_deploy.profiles.instrument import MTF_NYQUIST_MAX
 
     # One number is used for both axes.
-    parts = list(mtf) if isinstance(mtf, list | tuple) else str(mtf).split(",")
     try:
-        across, along = (float(part) for part in (parts * 2)[:2])
+        numbers = [float(part) for part in listed(mtf)]
+        across, along = numbers * 2 if len(numbers) == 1 else numbers
     except (TypeError, ValueError):
         # NaN lies within no limits, so the message below covers words as well.
         across = along = math.nan
-    if len(parts) > 2 or not (0 < across <= MTF_NYQUIST_MAX and 0 < along <= MTF_NYQUIST_MAX):
+    if not (0 < across <= MTF_NYQUIST_MAX and 0 < along <= MTF_NYQUIST_MAX):
         raise OptionError(
             f"`mtf` must be one or two ratios above 0 and up to {MTF_NYQUIST_MAX:.4f}, got "
             f"{mtf!r}. Write 0.07 for 7 %, or 0.09,0.05."

@@ -4,12 +4,11 @@ import logging
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.profiles.errors import OptionError, printable
+from beers_deploy.profiles.errors import OptionError, listed, printable
 from beers_deploy.verbs.parameters import (
     Factors,
     Holds,
@@ -186,8 +185,8 @@ def named_methods(methods: Methods) -> dict[str, Any]:
     """Return the methods by the names of their rows, the degraded input first."""
     if isinstance(methods, Mapping):
         return {"degraded": "degraded", **methods}
-    names = methods.split(",") if isinstance(methods, str) else methods
-    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+    names = listed(methods)
+    if not all(isinstance(name, str) for name in names):
         raise OptionError(
             f"`methods` must be names, or a mapping of names to networks or functions, got "
             f"{printable(repr(methods))}."
@@ -204,9 +203,8 @@ def numbers_of(name: str, value: Factors, example: str) -> tuple[float, ...]:
         value: its value.
         example: a valid value, for the error.
     """
-    parts = value.split(",") if isinstance(value, str) else value
     try:
-        return tuple(float(part) for part in ([parts] if isinstance(parts, Real) else parts))
+        return tuple(map(float, listed(value)))
     except (TypeError, ValueError) as error:
         raise OptionError(
             f"`{name}` must be numbers separated by commas, such as {example}, got {value!r}."
@@ -270,7 +268,7 @@ def _detection(
     named = [sensor or SENSOR]
     if isinstance(sensor, str):
         # A sensor that is named twice is compared once.
-        named = list(dict.fromkeys(name.strip() for name in sensor.split(",")))
+        named = list(dict.fromkeys(listed(sensor)))
     network = open_detector(detector, side_px)
     scenes, notes = labelled_scenes(
         network.names,

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError, listed
 from beers_deploy.profiles.shipped import DEFAULT_TARGET
 from beers_deploy.verbs.parameters import (
     Holds,
@@ -135,8 +135,8 @@ def _networks(network: Networks) -> "list[NetworkLike]":
         if not isinstance(each, str):
             names.append(each)
             continue
-        for name in each.split(","):
-            names += shipped_names() if name.strip() == "all" else [name.strip()]
+        for name in listed(each):
+            names += shipped_names() if name == "all" else [name]
     if not names:
         raise OptionError("`network` names no network. Give a name, a file, or all.")
     # A name that is given twice is compared once.

@@ -9,7 +9,7 @@ import numpy as np
 
 from beers_deploy.model.progress import steps
 from beers_deploy.model.traditional.rows import one_thread_per_operation
-from beers_deploy.profiles.errors import BeersError, OptionError, printable
+from beers_deploy.profiles.errors import BeersError, OptionError, listed, printable
 from beers_deploy.profiles.figures import Check, Figure, Row, measured, predicted
 from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.integer.reference import INT32_BITS
@@ -156,8 +156,7 @@ def chosen(names: str | Sequence[str] | None, available: Iterable[str], option: 
     every = list(available)
     if names is None:
         return every
-    parts = names.split(",") if isinstance(names, str) else names
-    selection = [name.strip() for name in parts]
+    selection = listed(names)
     for name in selection:
         if name not in every:
             raise OptionError(

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from beers_deploy.performance.swath import interval_ends
-from beers_deploy.profiles.errors import OptionError, printable
+from beers_deploy.profiles.errors import OptionError, listed, printable
 from beers_deploy.profiles.figures import Row
 from beers_deploy.studies.tradeoff.front import (
     BOARDS,
@@ -92,7 +92,7 @@ def parse_constraints(option: str, text: str | None) -> list[Constraint]:
         OptionError: a part has another form, or names an unknown figure or another unit.
     """
     limits = []
-    for part in map(str.strip, [] if text is None else text.split(",")):
+    for part in [] if text is None else listed(text):
         fields = CONSTRAINT.fullmatch(part)
         if fields is None or not math.isfinite(float(fields["limit"])):
             raise OptionError(
