@@ -3,7 +3,7 @@
 import logging
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError, listed
@@ -128,14 +128,9 @@ def _networks(network: Networks) -> "list[NetworkLike]":
     from beers_deploy.model.shipped import shipped_names
 
     names: list[NetworkLike] = []
-    several = [cast("NetworkLike", network)]
-    if isinstance(network, list | tuple):
-        several = list(network)
+    several: list[Any] = [*network] if isinstance(network, list | tuple) else [network]
     for each in several:
-        if not isinstance(each, str):
-            names.append(each)
-            continue
-        for name in listed(each):
+        for name in listed(each) if isinstance(each, str) else [each]:
             names += shipped_names() if name == "all" else [name]
     if not names:
         raise OptionError("`network` names no network. Give a name, a file, or all.")
