@@ -21,7 +21,7 @@ from beers_deploy.model.io.files import require_writable, write_text
 from beers_deploy.model.io.lock import only_run
 from beers_deploy.model.progress import held_back, steps
 from beers_deploy.model.raster.facts import require_raw
-from beers_deploy.model.raster.reader import open_raster, require_image_file
+from beers_deploy.model.raster.reader import open_raster
 from beers_deploy.model.raster.source import Source, fingerprint, stamps
 from beers_deploy.model.raster.writer import cog_bytes, padded_px, require_codec
 from beers_deploy.network import Network
@@ -39,7 +39,7 @@ from beers_deploy.restoration.interval import (
     write_half_widths,
 )
 from beers_deploy.restoration.memory import FLOAT_BYTES, peak_memory
-from beers_deploy.restoration.output import Output, require_tiff_name, what_was_done, write_output
+from beers_deploy.restoration.output import Output, what_was_done, write_output
 from beers_deploy.restoration.prepare import Pipeline, Restoration
 from beers_deploy.restoration.radiometry import Reading
 from beers_deploy.restoration.self_check import check_result, checks_of, write_map
@@ -215,12 +215,8 @@ def begun(image: Path, output: Output, reading: Reading) -> Iterator[Source]:
 
     Raises:
         BeersError: the image cannot be opened or was restored before, the output cannot be
-            written, is an input, has no name of a TIFF or a codec that GDAL lacks, or another run
-            writes it.
+            written, is an input or has a codec that GDAL lacks, or another run writes it.
     """
-    require_image_file(image)
-    require_writable(output.path, inputs=[image])
-    require_tiff_name(output.path)
     require_codec(output.compression)
     with only_run(output.path), open_raster(image, reading.force) as source:
         # Only an open index tells which tiles are read: no output may be one of them.
