@@ -124,7 +124,8 @@ def quantize(
         >>> bd.quantize(network, samples=samples, target="zcu102").precision
         'int8'
     """
-    options = partial(changed, quantize, locals())
+    given = dict(locals())
+    options = partial(changed, quantize, given)
 
     from beers_deploy.comparison import Data
     from beers_deploy.kit.board_file import require_core_file, save_core
@@ -171,22 +172,7 @@ def quantize(
     table = Table(
         command="quantize",
         arguments=recorded(
-            {
-                "network": result.origin,
-                "target": board,
-                "sensor": data.sensor,
-                "samples": samples,
-                "input_range": input_range,
-                "images": images,
-                "patches": patches,
-                "patch": patch,
-                "effort": effort,
-                "finetune": finetune,
-                "adapt": adapt,
-                "output": output,
-                "seed": seed,
-                "tile": tile,
-            }
+            {**given, "network": result.origin, "target": board, "sensor": data.sensor}
         ),
         title=f"{result.name}: each integer layer",
         inputs=(result.origin.input, *data.inputs),

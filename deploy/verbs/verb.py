@@ -56,10 +56,9 @@ def verb(function: Callable[P, R]) -> Callable[P, R]:
             if isinstance(error, BeersError):
                 raise
             raise missing_extra(error, function.__name__) from error
-        arguments = {k: v for k, v in bound.arguments.items() if k not in NOT_RECORDED}
 
         def named(table: Table) -> Table:
-            own = {**recorded(arguments), **table.arguments}
+            own = {**recorded(bound.arguments), **table.arguments}
             return replace(table, command=function.__name__, arguments=own)
 
         if isinstance(result, Table):
@@ -311,8 +310,10 @@ def refuse_without(other: str, **options: bool) -> None:
 
 
 def recorded(arguments: Mapping[str, object]) -> dict[str, object]:
-    """Return arguments as a results document has them: numbers, text, or the names of values."""
-    return {name: _recorded(value) for name, value in arguments.items()}
+    """Return arguments as a results document has them: numbers, text, or the names of values, of
+    those that decide a figure.
+    """
+    return {name: _recorded(v) for name, v in arguments.items() if name not in NOT_RECORDED}
 
 
 def _recorded(value: object) -> object:
