@@ -7,7 +7,6 @@ predicted, and the paper's figures.
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from itertools import product
 
 from beers_deploy.dpu.board import Dpu
