@@ -200,7 +200,8 @@ def test_the_exposures_of_an_image_are_those_of_each_tile_size(tmp_path: Path) -
 
 
 def test_the_bands_that_a_network_restores_together_all_take_the_processor_s_time() -> None:
-    step_s, pipeline_s = {}, {}
+    step_s = {}
+    pipeline_s = {}
     for bands in (1, 4):
         nodes = "a = Conv<pads=[1,1,1,1]>(image, weights) b = Relu(a) y = Add(image, b)"
         weights = np.ones((bands, bands, 3, 3))
