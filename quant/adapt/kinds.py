@@ -10,6 +10,7 @@ import numpy as np
 from beers_deploy.quant.adapt.zero_padding import pads_of
 from beers_deploy.quant.graph.attention import shrinking
 from beers_deploy.quant.graph.host_end import host_end
+from beers_deploy.quant.graph.mirror import image_mirror
 from beers_deploy.quant.graph.normalization import Normalization, lone_deviation
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
@@ -185,7 +186,7 @@ def nodes_by_kind(graph: OnnxGraph) -> dict[Kind, list[Node]]:
         kind = kind_of(graph, node)
         if kind is not None and node.result not in on_host:
             nodes.setdefault(kind, []).append(node)
-    # The host mirrors the image itself.
-    if all(node.source in graph.inputs for node in nodes.get(Kind.padding, [])):
+    if image_mirror(graph) is not None:
+        # The only Pad, which the host does.
         nodes.pop(Kind.padding, None)
     return nodes

@@ -6,8 +6,8 @@ on.
 - `reader`: from float ONNX (`node_operations`, one by one) to a `split_network`, cut where the
   host's part ends; `plain` accepts networks of ConvBEERS' kind only;
 - `writer`: back to float ONNX;
-- `host_end`: what the host computes behind the core, such as an activation, and the `base` that
-  a result is added to;
+- `mirror` and `host_end`: what the host does in front of the core, and computes behind it, such as
+  an activation, and the `base` that a result is added to;
 - `attention`, `deviation` and `normalization`: replace what a DPU lacks, for reader and
   `quant.adapt`;
 - `pixel_shuffle`, `quantized`: what checker and tiling read from a file as well.

@@ -13,6 +13,7 @@ from onnx import ModelProto
 from beers_deploy.profiles.errors import ModelError, counted
 from beers_deploy.quant.graph.attention import aligned, shrinking
 from beers_deploy.quant.graph.host_end import host_end
+from beers_deploy.quant.graph.mirror import image_mirror
 from beers_deploy.quant.graph.node_operations import ACTIVATIONS, READERS, read_activation, require
 from beers_deploy.quant.graph.normalization import Normalization, lone_deviation
 from beers_deploy.quant.graph.operations import (
@@ -44,7 +45,7 @@ from beers_deploy.quant.graph.split_network import (
     unsupported,
 )
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
-from beers_deploy.quant.onnx.resize import Resizing, enlarges_image
+from beers_deploy.quant.onnx.resize import Resizing
 from beers_deploy.quant.onnx.runnable import check_runnable
 from beers_deploy.quant.simplify.fold_affine import affine_of
 from beers_deploy.quant.simplify.standard_operators import float_shapes
@@ -165,25 +166,15 @@ class _Reader:
     def _take_mirror(self) -> int:
         """Remove a Pad that mirrors the image, and return its border in pixels; the host does the
         padding.
-
-        The host also adds the image to the result, so the sum may read the image without the Pad.
         """
         source = self.source
-        pads = [node for node in source.nodes if node.op_type == "Pad"]
-        others = [node for node in source.readers[self.image] if node not in pads]
-        # The host adds the image, or enlarges it.
-        is_of_host = all(n.op_type == "Add" or enlarges_image(source, n) for n in others)
-        is_mirror = len(pads) == 1 and pads[0].source == self.image and is_of_host
-        if not is_mirror or pads[0].attributes.get("mode") != "reflect":
+        mirror = image_mirror(source)
+        if mirror is None:
             return 0
-        amounts = source.numbers(pads[0], 1, "pads") or [0]
-        border_px = int(amounts[-1])
-        if amounts != [0, 0, border_px, border_px] * 2 or border_px < 1:
-            return 0
-        mirrored = pads[0].result
-        for node in source.readers[mirrored]:
-            node.inputs = tuple(self.image if n == mirrored else n for n in node.inputs)
-        source.set_nodes([node for node in source.nodes if node is not pads[0]])
+        pad, border_px = mirror
+        for node in source.readers[pad.result]:
+            node.inputs = tuple(self.image if n == pad.result else n for n in node.inputs)
+        source.set_nodes([node for node in source.nodes if node is not pad])
         return border_px
 
     def channels(self) -> int:
