@@ -317,8 +317,8 @@ def losses(
         advice = "; no loss of PSNR, because references are not of the result's size"
         return f"INT8 differs from float by {mae} ({gate.source}){advice if unfit else ''}"
     message = (
-        f"INT8 loses {gate.drop_db:.2f} dB of {gate.psnr_float_db:.2f}, and "
-        f"{gate.worst_drop_db:.2f} dB where most ({gate.source})"
+        f"INT8 {_change(gate.drop_db)} against {gate.psnr_float_db:.2f} dB in float, and "
+        f"{_change(gate.worst_drop_db)} at worst ({gate.source})"
     )
     if gate.drop_db <= MUCH_DB:
         return message
@@ -327,6 +327,11 @@ def losses(
     # A network that is fine-tuned already gains nothing more by it.
     advice = "" if FINETUNE in metadata(result.host) else "; try `finetune` auto"
     return f"{message}: most of it in {names}{advice}"
+
+
+def _change(drop_db: float) -> str:
+    """Return a drop of PSNR in words, such as "loses 0.10 dB"."""
+    return f"gains {-drop_db:.2f} dB" if drop_db < 0 else f"loses {drop_db:.2f} dB"
 
 
 MOST = 3

@@ -106,8 +106,11 @@ def test_the_loss_is_reported_and_a_large_one_with_its_layer(
     assert gate.worst_drop_db > gate.drop_db
     slight = replace(gate, psnr_float_db=40.0, psnr_int8_db=39.9, worst_drop_db=2.0)
     assert losses(corrupted, slight, patches) == (
-        "INT8 loses 0.10 dB of 40.00, and 2.00 dB where most (6 simulated patches of 128 x 128)"
+        "INT8 loses 0.10 dB against 40.00 dB in float, and loses 2.00 dB at worst "
+        "(6 simulated patches of 128 x 128)"
     )
+    better = replace(slight, psnr_int8_db=40.2)
+    assert losses(corrupted, better, patches).startswith("INT8 gains 0.20 dB against 40.00 dB")
     strong = replace(slight, psnr_int8_db=39.6)
     much = losses(corrupted, strong, patches)
     layers, _ = layer_errors(
