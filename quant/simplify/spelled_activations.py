@@ -197,22 +197,12 @@ def _cubic_input(graph: OnnxGraph, node: Node | None) -> str | None:
     if total is None or total.op_type != "Add":
         return None
     for source, scaled in (total.inputs, total.inputs[::-1]):
-        cube = other_operand(graph, graph.writers.get(scaled), "Mul", 0.044715)
-        factors = _factors(graph, cube) if cube else []
-        if len(factors) == 3 and set(factors) == {source}:
+        cube = graph.writers.get(
+            other_operand(graph, graph.writers.get(scaled), "Mul", 0.044715) or ""
+        )
+        if cube is not None and _gated_by(graph, cube, _squared) == source:
             return source
     return None
-
-
-def _factors(graph: OnnxGraph, name: str) -> list[str]:
-    """Return the tensors whose product a tensor is; itself if it is no product."""
-    node = graph.writers.get(name)
-    if node is None or node.op_type != "Mul":
-        return [name]
-    factors = []
-    for factor in node.inputs:
-        factors += _factors(graph, factor)
-    return factors
 
 
 def _gated_by(
@@ -223,6 +213,13 @@ def _gated_by(
         return None
     pairs = node.inputs, node.inputs[::-1]
     return next((source for source, gate in pairs if source == gated(graph, gate)), None)
+
+
+def _squared(graph: OnnxGraph, name: str) -> str | None:
+    """Return x if a tensor is x times x."""
+    node = graph.writers.get(name)
+    is_square = node is not None and node.op_type == "Mul" and len(set(node.inputs)) == 1
+    return node.source if node is not None and is_square else None
 
 
 def _hard_sigmoid_of(graph: OnnxGraph, name: str) -> str | None:
