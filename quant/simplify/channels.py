@@ -13,7 +13,6 @@ A Split, Slice or Gather along the channels has parts, each a list of channels:
 A DPU adds and multiplies maps of one number of channels:
 
 4. A map of one channel that meets several is repeated first, as a Tile along the channels does.
-5. Channels of the image that a Concat repeats come from one convolution as well.
 
 All of it is exact. The divided nodes remain, and are removed if nothing reads them.
 """
@@ -90,6 +89,8 @@ def _compute(
         divides: True if the map is never needed as a whole, so that its operations are divided (1);
             False if the channels are selected (2).
     """
+    # A part may be divided again.
+    graph.shapes[name] = (graph.shapes[source][0], len(channels), *graph.shapes[source][2:])
     before = graph.writers.get(source) if divides else None
     inner = f"{name}.before"
     in_front = []
@@ -212,34 +213,6 @@ def repeat_channels(graph: OnnxGraph, node: Node) -> list[Node] | None:
     repeated = graph.convolution(narrow, name, name, np.ones((channels, 1, 1, 1)))
     node.inputs = tuple(name if each == narrow else each for each in node.inputs)
     return [repeated, node]
-
-
-def join_copies(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Let one convolution write the channels of the image that a Concat joins, such as copies.
-
-    Args:
-        graph: the graph that the node belongs to; its constants are extended.
-        node: any node.
-
-    Returns:
-        The convolution; None if the node joins anything else.
-    """
-    (image, *_) = graph.inputs
-    if node.op_type != "Concat" or node.attributes.get("axis") != 1:
-        return None
-    weights = []
-    for name in node.inputs:
-        conv = graph.writers.get(name)
-        if name == image:
-            weights.append(np.eye(graph.inputs[image][1])[:, :, None, None])
-        elif conv is not None and conv.op_type == "Conv" and conv.source == image:
-            weights.append(graph.constants[conv.inputs[1]])
-        else:
-            return None
-        is_plain = conv is None or (len(conv.inputs) == 2 and not conv.groups > 1)
-        if weights[-1].shape[2:] != (1, 1) or not is_plain:
-            return None
-    return [graph.convolution(image, node.result, node.name, np.concatenate(weights))]
 
 
 def broadcasts_channels(model: ModelProto) -> bool:

@@ -14,7 +14,8 @@ these properties:
    channels; Sum is Add, a square is a product, a mean over the image is GlobalAveragePool, a
    maximum over an image of known size MaxPool. HardSwish is one operator, ReLU6 is Clip
    from 0 to 6, and a Clip at 0 alone is ReLU. Activations precede what only moves values. Nothing
-   splits or crops a map: each part is computed separately. Kernels have at most 64 positions.
+   splits or crops a map: each part is computed separately, from the image itself where it mixes
+   its channels. Kernels have at most 64 positions.
    Nothing is computed from the size of the image, unless the size has an effect. The channels of
    the image come first.
 5. Operators are those of opset 17, unless one has no form there.
@@ -35,7 +36,7 @@ models that `quant.onnx.runnable` accepted are simplified, because a runtime ope
 
 from copy import deepcopy
 from functools import partial
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -54,7 +55,6 @@ from beers_deploy.quant.simplify.activations_first import (
 from beers_deploy.quant.simplify.branches import JoinBranches
 from beers_deploy.quant.simplify.channels import (
     broadcasts_channels,
-    join_copies,
     read_unselected,
     repeat_channels,
     split_channels,
@@ -69,6 +69,7 @@ from beers_deploy.quant.simplify.fold_affine import (
 )
 from beers_deploy.quant.simplify.free_sizes import free_rectangle, free_sizes
 from beers_deploy.quant.simplify.fully_connected import ConnectByConvolutions, connect_neighbours
+from beers_deploy.quant.simplify.image_mixtures import ReadImage
 from beers_deploy.quant.simplify.image_residual import add_to_image, clip_last
 from beers_deploy.quant.simplify.missing_border import with_missing_border
 from beers_deploy.quant.simplify.slices import convolve_slice, unshuffle_slices
@@ -214,7 +215,7 @@ def _run_passes(model: ModelProto) -> None:
     ):
         graph.rewrite(with_shapes)
     fold_in_front(graph)
-    for last in (read_unselected, join_copies, ConnectByConvolutions()):
+    for last in (read_unselected, ReadImage(graph), ConnectByConvolutions()):
         graph.rewrite(last)
     graph.save()
 
@@ -235,8 +236,9 @@ def _is_plain(model: ModelProto) -> bool:
     if not is_of_plain_operators:
         return False
     graph = OnnxGraph(model)
+    rewritings = (without_groups, split_large_kernel, ReadImage(graph))
     has_other_convolutions = any(
-        without_groups(graph, node) or split_large_kernel(graph, node) for node in graph.nodes
+        rewriting(graph, node) for node, rewriting in product(graph.nodes, rewritings)
     )
     return not has_other_convolutions and not broadcasts_channels(model)
 

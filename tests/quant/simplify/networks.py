@@ -166,7 +166,7 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
     "a partial convolution": (
         f"""k, l = Split<axis=1>(x, one_three) m = {SAME}(k, one_one) d = Concat<axis=1>(m, l)
         e = {SAME}(d, w) y = Add(e, x)""",
-        {"Conv": 3, "Concat": 1, "Add": 1},
+        {"Conv": 2, "Concat": 1, "Add": 1},
     ),
     "weights by their norm": (
         """n = ReduceL2<axes=[1,2,3]>(w) d = Div(w, n) v = Mul(d, lengths)
@@ -314,7 +314,7 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
     "the largest channel": ("y = ReduceMax<axes=[1]>(x)", {"Conv": 4, "Relu": 2, "Add": 2}),
     "the largest of three channels": (
         "s = Slice(x, one_int, last, one_int) y = ReduceMax<axes=[-3]>(s)",
-        {"Conv": 5, "Relu": 2, "Add": 2},
+        {"Conv": 4, "Relu": 2, "Add": 2},
     ),
     "the largest pixel": (
         "s = Resize(x, , , small) m = ReduceMax<axes=[2,3]>(s) g = GlobalMaxPool(s) y = Add(m, g)",
