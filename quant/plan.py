@@ -37,6 +37,7 @@ from beers_deploy.quant.passes.residual_groups import (
     ResidualGroup,
     exceeds_six,
     finer_members,
+    n_factors,
     single_tensors,
 )
 from beers_deploy.quant.passes.selection import ALL, Passes
@@ -94,13 +95,7 @@ class Plan:
         Effort and time of the search are estimated from them before it begins.
         """
         groups = self.groups if self.passes.equalization else []
-        widths = channels_of(self.graph, {PLANES: self.host_part.planes})
-        stages = [
-            Stage(
-                group, FIRST_GUESSES, max(part.stop or widths[name] for name, part in group.items())
-            )
-            for group in groups
-        ]
+        stages = [Stage(group, FIRST_GUESSES, n_factors(group)) for group in groups]
         singles = self.singles.stages(self.effort) if self.singles.tensors else []
         return [*stages, *singles]
 
@@ -134,15 +129,11 @@ class Plan:
 
 
 def singles_of(graph: Graph, host_part: HostPart, groups: list[ResidualGroup]) -> SingleTensors:
-    """Return the tensors that are equalised in addition to these groups.
-
-    There are none if there are groups and no depthwise convolutions.
-    """
+    """Return the tensors that are equalised in addition to these groups."""
     depthwise = any(isinstance(op, Conv) and op.groups > 1 for op in graph)
-    # Next to a group this made no dense network for one sensor better: see `equalize_single`.
-    names = single_tensors(graph) if depthwise or not groups else []
+    names = tuple(single_tensors(graph))
     widths = channels_of(graph, {PLANES: host_part.planes})
-    return SingleTensors(tuple(names), tuple(widths[name] for name in names))
+    return SingleTensors(names, tuple(widths[name] for name in names), depthwise or not groups)
 
 
 def rounded(plan: Plan, images: Sequence[np.ndarray]) -> tuple[IntCore, Graph]:

@@ -21,7 +21,11 @@ from beers_deploy.model.progress import steps
 from beers_deploy.quant.frac_bits import INT8_MAX
 from beers_deploy.quant.graph import Activation, Conv, Graph
 from beers_deploy.quant.host_part import ONE_CHANNEL, HostPart
-from beers_deploy.quant.passes.residual_groups import GROUP_FRAC_BITS, ResidualGroup
+from beers_deploy.quant.passes.residual_groups import (
+    GROUP_FRAC_BITS,
+    ResidualGroup,
+    n_factors,
+)
 from beers_deploy.quant.passes.trial import Costs, Trial
 from beers_deploy.quant.session import values_of
 
@@ -76,7 +80,7 @@ def equalize(graph: Graph, group: ResidualGroup, factors: np.ndarray) -> Graph:
             factors[part] = 1.0
         if op.activation is Activation.relu6:
             # 2. Below this factor int8 would end above six, and ReLU could not replace ReLU6.
-            factors[part] = np.maximum(factors[part], FULL / op.ceilings)
+            np.maximum.at(factors, part, FULL / op.ceilings)
     return tuple(
         _scaled(op, factors, group)
         if isinstance(op, Conv) and group.keys() & {op.input, op.output}
@@ -133,11 +137,10 @@ def channel_ranges(
         name: np.mean(sizes, axis=0)
         for name, sizes in zip(names, zip(*tiles, strict=True), strict=True)
     }
-    ranges = np.zeros(max(group[name].stop or len(mean) for name, mean in means.items()))
-    # Tensors of a group share their factors, so the range of a channel is its largest in any of
-    # them.
+    ranges = np.zeros(n_factors(group))
+    # Channels that share a factor also share its range, the largest of any of them.
     for name, mean in means.items():
-        ranges[group[name]] = np.maximum(ranges[group[name]], mean)
+        np.maximum.at(ranges, group[name], mean)
     return above_dead(ranges)
 
 

@@ -1,7 +1,8 @@
 """Find the residual groups: tensors that adds connect, and that share one scale in the core.
 
-1. Group tensors that an add, a pool, an enlargement or a concat connects.
-2. Place each tensor's channels among the group's factors: a concat puts them side by side.
+1. Group tensors that an add, a pool, an enlargement, a pixel shuffle or a concat connects.
+2. Find which channels have one factor: a concat puts its inputs' channels side by side, a pixel
+   shuffle makes one channel from several.
 3. Leave out groups with an operation that a factor per channel does not pass, or that the host
    writes or reads.
 4. Find single tensors: those of no group that convolutions alone write and read.
@@ -12,8 +13,12 @@ normalisation behind the first tensor magnifies its steps: with one scale for al
 lost 4.6 instead of 1.1 dB (measured).
 """
 
-from collections.abc import Mapping, Sequence
-from itertools import accumulate, chain, repeat
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from beers_deploy.quant.frac_bits import INT8_MAX
 from beers_deploy.quant.graph import (
@@ -30,6 +35,7 @@ from beers_deploy.quant.graph import (
     Op,
     Pointwise,
     Resize,
+    Shuffle,
     channels_of,
 )
 from beers_deploy.quant.graph.ties import united
@@ -41,18 +47,23 @@ GROUP_FRAC_BITS = 8
 SPARE_BITS = 2
 """Unused bits from which on a tensor has a finer scale than its group."""
 
-ResidualGroup = Mapping[str, slice]
-"""Tensors that have the same factors, channel by channel, and the slice of the factors that belongs
-to each. Each tensor is added to another one, or is such a sum, or is derived from them by a pool,
-an enlargement or a concat.
+ResidualGroup = Mapping[str, np.ndarray]
+"""Tensors that share factors, and for each of them the number of every channel's factor (C,). Each
+tensor is added to another one, or is such a sum, or is derived from them by a pool, an enlargement,
+a pixel shuffle or a concat.
 """
-PASSING = (Concat, MaxPool, AveragePool, Resize)
+PASSING = (Concat, MaxPool, AveragePool, Resize, Shuffle)
 """Operations that pass channels on without mixing them."""
 
 
-def only(name: str) -> ResidualGroup:
+def only(name: str, channels: int) -> ResidualGroup:
     """Return one tensor as a group by itself, so that functions for residual groups accept it."""
-    return {name: slice(None)}
+    return {name: np.arange(channels)}
+
+
+def n_factors(group: ResidualGroup) -> int:
+    """Return the number of factors that the tensors of a group share."""
+    return 1 + max(int(numbers.max()) for numbers in group.values())
 
 
 def residual_groups(graph: Graph) -> list[ResidualGroup]:
@@ -60,15 +71,14 @@ def residual_groups(graph: Graph) -> list[ResidualGroup]:
     equalised.
 
     Only convolutions, adds and operations that pass channels on write and read them, with nothing
-    in between that blocks a factor per channel. Groups that a product, a pixel shuffle or the
-    network's end reads are excluded.
+    in between that blocks a factor per channel. Groups that a product or the network's end
+    reads are excluded.
 
     Args:
         graph: a float graph.
 
     Returns:
-        The groups in the order of the graph, each a dict from tensor name to the slice of the
-        group's channels.
+        The groups in the order of the graph.
     """
     # 1.
     linking = [op for op in graph if isinstance(op, Add) or _passes_channels(op)]
@@ -78,41 +88,58 @@ def residual_groups(graph: Graph) -> list[ResidualGroup]:
         [name for name in leader if leader[name] == first]
         for first in dict.fromkeys(leader.values())
     ]
-    # 2.
-    placed = [_placed(linking, group, graph) for group in groups if leader[group[0]] in sums]
     # 3.
-    return [group for group in placed if group and _passes_factors(graph, group)]
+    named = [
+        group for group in groups if leader[group[0]] in sums and _passes_factors(graph, group)
+    ]
+    planes = next((op.weight.shape[1] for op in graph if isinstance(op, Conv)), 0)
+    widths = channels_of(graph, {PLANES: planes}) if named else {}
+    # 2.
+    return [_numbered(linking, group, widths) for group in named]
 
 
-def _placed(linking: Sequence[Op], names: Sequence[str], graph: Graph) -> ResidualGroup:
-    """Return the slices of the channels of these tensors; empty if one would need two slices."""
-    writers = [op for op in linking if op.output in names]
-    # Only a concat puts channels at other places than those of its inputs.
-    if not any(isinstance(op, Concat) for op in writers):
-        return dict.fromkeys(names, slice(None))
-    planes = next(op.weight.shape[1] for op in graph if isinstance(op, Conv))
-    widths = channels_of(graph, {PLANES: planes})
-    # Each input, the output, and where the input's channels stand in the output.
-    links = []
-    for op in writers:
-        before = accumulate((widths[name] for name in op.inputs[:-1]), initial=0)
-        offsets = before if isinstance(op, Concat) else repeat(0, len(op.inputs))
-        links += [(name, op.output, by) for name, by in zip(op.inputs, offsets, strict=True)]
-    first = {names[0]: 0}
-    # The tensors are linked to each other, so every sweep places at least one more.
-    while len(first) < len(names):
-        for part, result, by in links:
-            if result in first:
-                first.setdefault(part, first[result] + by)
-            elif part in first:
-                first[result] = first[part] - by
-    # A channel at two places would need two factors.
-    if any(first[part] != first[result] + by for part, result, by in links):
-        return {}
-    least = min(first.values())
-    return {
-        name: slice(start - least, start - least + widths[name]) for name, start in first.items()
-    }
+def _numbered(
+    linking: Sequence[Op], names: Sequence[str], widths: Mapping[str, int]
+) -> ResidualGroup:
+    """Return the number of the factor of each channel of these tensors.
+
+    Args:
+        linking: the operations that connect tensors.
+        names: the tensors of a group.
+        widths: the number of channels of each tensor.
+    """
+    # The widest first, so that the factors have the order of a concat's channels.
+    names = sorted(names, key=lambda name: -widths[name])
+    ends = np.cumsum([0, *(widths[name] for name in names)])
+    nodes = {name: np.arange(*ends[k : k + 2]) for k, name in enumerate(names)}
+    edges = [
+        (nodes[name][before], nodes[op.output][after])
+        for op in linking
+        if op.output in nodes
+        for name, before, after in _links(op, widths)
+    ]
+    first, second = (np.concatenate(side) for side in zip(*edges, strict=True))
+    adjacency = coo_array((np.ones(len(first)), (first, second)), (ends[-1],) * 2)
+    _, numbers = connected_components(adjacency, directed=False)
+    return {name: numbers[each] for name, each in nodes.items()}
+
+
+def _links(op: Op, widths: Mapping[str, int]) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yield, for each input of an operation, its name and the numbers of the channels that need one
+    factor: those of the input, and those of the output.
+    """
+    if isinstance(op, Shuffle):
+        channels = np.arange(widths[op.input])[None, :, None, None]
+        # Each pixel of the result shows the channel that it comes from.
+        origin = op(np.broadcast_to(channels, (1, widths[op.input], op.block, op.block)))
+        after = np.broadcast_to(np.arange(widths[op.output])[:, None, None], origin.shape[1:])
+        yield op.input, origin.ravel(), after.ravel()
+        return
+    start = 0
+    for name in op.inputs:
+        channels = np.arange(widths[name])
+        yield name, channels, channels + start
+        start += widths[name] if isinstance(op, Concat) else 0
 
 
 def exceeds_six(graph: Graph, group: ResidualGroup, frac_bits: Mapping[str, int]) -> bool:
@@ -150,7 +177,7 @@ def single_tensors(graph: Graph) -> list[str]:
     terms = set(chain.from_iterable((*op.inputs, op.output) for op in adds))
     outputs = [op.output for op in graph if isinstance(op, Conv) and op.output not in terms]
     passing = set(chain.from_iterable(op.inputs for op in graph if _passes_channels(op)))
-    return [name for name in outputs if name not in passing and _passes_factors(graph, only(name))]
+    return [name for name in outputs if name not in passing and _passes_factors(graph, [name])]
 
 
 def _passes_channels(op: Op) -> bool:
@@ -162,22 +189,22 @@ def _passes_channels(op: Op) -> bool:
     return isinstance(op, PASSING)
 
 
-def _passes_factors(graph: Graph, group: ResidualGroup) -> bool:
-    """Return True if all operations on a group's tensors allow a factor for each channel.
+def _passes_factors(graph: Graph, names: Sequence[str]) -> bool:
+    """Return True if all operations on these tensors allow a factor for each channel.
 
     ReLU6 allows it behind a convolution, where `equalize` can make the end of int8 its clip, but
     not behind an add.
     """
-    touching = [op for op in graph if group.keys() & {*op.inputs, op.output}]
+    touching = [op for op in graph if not {*op.inputs, op.output}.isdisjoint(names)]
     # The host, which has no factors, writes the planes and reads the correction.
-    if group.keys() & {PLANES, CORRECTION}:
+    if not {PLANES, CORRECTION}.isdisjoint(names):
         return False
     if not all(isinstance(op, Conv | Add) or _passes_channels(op) for op in touching):
         return False
     return all(
         op.activation.homogeneous or (isinstance(op, Conv) and op.activation is Activation.relu6)
         for op in touching
-        if op.output in group and isinstance(op, Conv | Add)
+        if op.output in names and isinstance(op, Conv | Add)
     )
 
 

@@ -23,8 +23,10 @@ from beers_deploy.quant.graph import (
     Conv,
     Graph,
     MaxPool,
+    Op,
     Pointwise,
     Resize,
+    Shuffle,
     Window,
     graph_to_onnx,
 )
@@ -43,6 +45,7 @@ from beers_deploy.quant.passes.residual_groups import (
     GROUP_FRAC_BITS,
     ResidualGroup,
     exceeds_six,
+    n_factors,
     residual_groups,
 )
 from beers_deploy.quant.passes.selection import Passes
@@ -53,6 +56,8 @@ from beers_deploy.quant.session import open_session
 from tests.quant.quick import image, in_float, quickly, random_conv, run_model
 from tests.quant.simplify.networks import parsed
 from tests.quant.test_odd_networks import SAME, sketch
+
+ENLARGING = Resize("resize", "deep", "up", 2)
 
 
 def group_of(graph: Graph) -> ResidualGroup:
@@ -87,34 +92,49 @@ def test_ranges_are_equalized_to_the_group_s_own(graph: Graph, patches: Patches)
     assert dead_ranges[3] >= 1e-4 * dead_ranges.max()
 
 
-def skipping() -> Graph:
+def skipping(enlarging: Op = ENLARGING) -> Graph:
     """Build a graph that pools and enlarges a sum behind a ReLU6, and concatenates both."""
     conv = partial(random_conv, np.random.default_rng(0))
+    deep = 8 if isinstance(enlarging, Shuffle) else 2
     return (
         conv(PLANES, "head", (3, 3, 1, 1), Activation.relu6),
         conv("head", "inner", (3, 3, 1, 1)),
         Add("add", ("head", "inner"), "sum"),
         MaxPool("max", "sum", "pooled", (2, 2), Window((2, 2))),
-        conv("pooled", "deep", (2, 3, 1, 1)),
-        Resize("resize", "deep", "up", 2),
+        conv("pooled", "deep", (deep, 3, 1, 1)),
+        enlarging,
         Concat("join", ("up", "sum"), "both"),
         conv("both", CORRECTION, (1, 5, 1, 1)),
     )
 
 
-def test_a_group_goes_through_pools_enlargements_and_concats() -> None:
-    graph = skipping()
+@pytest.mark.parametrize(
+    ("enlarging", "deep"),
+    [
+        (ENLARGING, [0, 1]),
+        (Shuffle("shuffle", "deep", "up", 2), [0, 0, 0, 0, 1, 1, 1, 1]),
+        (Shuffle("shuffle", "deep", "up", 2, columns_first=False), [0, 1] * 4),
+    ],
+)
+def test_a_group_goes_through_what_passes_channels_on(enlarging: Op, deep: list[int]) -> None:
+    graph = skipping(enlarging)
     group = group_of(graph)
-    fine = dict.fromkeys(("head", "inner", "sum", "pooled"), slice(2, 5))
-    coarse = dict.fromkeys(("deep", "up"), slice(0, 2))
-    assert group == {**fine, **coarse, "both": slice(0, 5)}
+    fine = [2, 3, 4]
+    expected = {"head": fine, "inner": fine, "sum": fine, "pooled": fine}
+    expected |= {"deep": deep, "up": [0, 1], "both": [0, 1, *fine]}
+    assert {name: numbers.tolist() for name, numbers in group.items()} == expected
+    assert_scales(graph, group)
+
+
+def assert_scales(graph: Graph, group: ResidualGroup) -> None:
+    """Check that factors change no result of the float network."""
     planes = {PLANES: np.random.default_rng(1).normal(0, 3, (1, 3, 6, 10)).astype(np.float32)}
-    scaled = equalize(graph, group, np.random.default_rng(2).lognormal(-1, 1, 5))
-    expected, actual = (
+    scaled = equalize(graph, group, np.random.default_rng(2).lognormal(-1, 1, n_factors(group)))
+    before, after = (
         open_session(graph_to_onnx(each, [CORRECTION])).run(None, planes)[0]
         for each in (graph, scaled)
     )
-    assert_allclose(actual, expected, atol=1e-4)
+    assert_allclose(after, before, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -135,14 +155,14 @@ def test_a_group_goes_through_activations_in_proportion_to_their_input(
         assert_allclose(correction(scaled), correction(graph), atol=2e-6)
 
 
-def test_a_tensor_with_two_positions_in_a_concat_is_in_no_group() -> None:
+def test_a_tensor_with_two_positions_in_a_concat_has_the_same_factors_in_both() -> None:
     *before, join, last = skipping()
     assert isinstance(last, Conv)
     twice = replace(join, inputs=("sum", "sum"))  # type: ignore[type-var]
-    assert (
-        residual_groups((*before, twice, replace(last, weight=np.ones((1, 6, 1, 1), np.float32))))
-        == []
-    )
+    graph = (*before, twice, replace(last, weight=np.ones((1, 6, 1, 1), np.float32)))
+    group = group_of(graph)
+    assert group["both"].tolist() == [0, 1, 2, 0, 1, 2]
+    assert_scales(graph, group)
 
 
 @pytest.mark.parametrize(("bits", "beyond"), [(5, False), (4, True)])
@@ -272,7 +292,8 @@ def test_each_step_is_named(float_onnx: onnx.ModelProto, patches: Patches) -> No
     with reporting(reported.append), progress("calibrating"):
         quickly(float_onnx, patches)
     names = [step.what.removeprefix("calibrating: ") for step in reported]
-    assert [name.split(" ")[0] for name in names] == ["scale", "float", "equalising"]
+    named = dict.fromkeys(name.split(" ")[0] for name in names)
+    assert [*named] == ["scale", "float", "equalising", "first", "tensors"]
 
 
 def one_scale() -> AbstractContextManager[object]:
