@@ -71,8 +71,8 @@ def residual_groups(graph: Graph) -> list[ResidualGroup]:
     equalised.
 
     Only convolutions, adds and operations that pass channels on write and read them, with nothing
-    in between that blocks a factor per channel. Groups that a product or the network's end
-    reads are excluded.
+    in between that blocks a factor per channel. Groups that a product or the network's end reads
+    are excluded.
 
     Args:
         graph: a float graph.
@@ -109,15 +109,14 @@ def _numbered(
         widths: the number of channels of each tensor.
     """
     # The widest first, so that the factors have the order of a concat's channels.
-    names = sorted(names, key=lambda name: -widths[name])
-    ends = np.cumsum([0, *(widths[name] for name in names)])
-    nodes = {name: np.arange(*ends[k : k + 2]) for k, name in enumerate(names)}
-    edges = [
-        (nodes[name][before], nodes[op.output][after])
-        for op in linking
-        if op.output in nodes
-        for name, before, after in _links(op, widths)
-    ]
+    ordered = sorted(names, key=lambda name: -widths[name])
+    ends = np.cumsum([0, *(widths[name] for name in ordered)])
+    # Each channel of each tensor has a number.
+    nodes = {name: np.arange(*ends[k : k + 2]) for k, name in enumerate(ordered)}
+    edges = []
+    for op in linking:
+        if op.output in nodes:
+            edges += [(nodes[name][a], nodes[op.output][b]) for name, a, b in _links(op, widths)]
     first, second = (np.concatenate(side) for side in zip(*edges, strict=True))
     adjacency = coo_array((np.ones(len(first)), (first, second)), (ends[-1],) * 2)
     _, numbers = connected_components(adjacency, directed=False)

@@ -110,5 +110,5 @@ def _mixed(weight: np.ndarray, groups: int, mixture: np.ndarray) -> np.ndarray:
     """
     by_group = weight.astype(np.float64).reshape(groups, -1, *weight.shape[1:])
     mixtures = mixture.reshape(groups, -1, mixture.shape[1])
-    mixed = np.einsum("gomrc,gmi->goirc", by_group, mixtures)
+    mixed: np.ndarray = np.einsum("gomrc,gmi->goirc", by_group, mixtures)
     return mixed.reshape(-1, *mixed.shape[2:])

@@ -15,9 +15,8 @@ these properties:
    maximum over an image of known size MaxPool. HardSwish is one operator, ReLU6 is Clip
    from 0 to 6, and a Clip at 0 alone is ReLU. Activations precede what only moves values. Nothing
    splits or crops a map: each part is computed separately, from the image itself where it mixes
-   its channels. Kernels have at most 64 positions.
-   Nothing is computed from the size of the image, unless the size has an effect. The channels of
-   the image come first.
+   its channels. Kernels have at most 64 positions. Nothing is computed from the size of the image,
+   unless the size has an effect. The channels of the image come first.
 5. Operators are those of opset 17, unless one has no form there.
 6. The result of a network without padding has the image's size, or a multiple of it: the image is
    mirrored beyond its borders.
@@ -47,7 +46,7 @@ from onnx.shape_inference import InferenceError
 
 from beers_deploy.profiles.errors import ModelError, reason_of
 from beers_deploy.quant.domains import IR_VERSION, OPSET, opset_of
-from beers_deploy.quant.onnx.graph import OnnxGraph, free_name
+from beers_deploy.quant.onnx.graph import OnnxGraph, Rewriting, free_name
 from beers_deploy.quant.simplify.activations_first import (
     activations_first,
     behind_convolutions,
@@ -236,7 +235,7 @@ def _is_plain(model: ModelProto) -> bool:
     if not is_of_plain_operators:
         return False
     graph = OnnxGraph(model)
-    rewritings = (without_groups, split_large_kernel, ReadImage(graph))
+    rewritings: list[Rewriting] = [without_groups, split_large_kernel, ReadImage(graph)]
     has_other_convolutions = any(
         rewriting(graph, node) for node, rewriting in product(graph.nodes, rewritings)
     )
