@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from beers_deploy.profiles.errors import LONGEST, ModelError, counted, printable
-from beers_deploy.quant.graph.base import THE_IMAGE, Base
+from beers_deploy.quant.graph.host_steps import HostSteps
 from beers_deploy.quant.graph.operations import (
     CORRECTION,
     IMAGE,
@@ -39,7 +39,7 @@ ADAPT_EXACTLY = "'quantize --adapt' (adapt=True) rewrites it exactly."
 
 
 @dataclass(frozen=True)
-class SplitNetwork:
+class SplitNetwork(HostSteps):
     """A float network, split where the DPU's part begins and ends.
 
     The host shuffles pixels and adds the image. The DPU computes everything else.
@@ -48,31 +48,12 @@ class SplitNetwork:
         graph: the operations that the DPU computes in INT8, from the tensor `IMAGE` to
             `CORRECTION`.
         channels: the number of channels of the image, before `front`.
-        front: pixel unshuffles of the image by the host, which come first.
-        back: pixel shuffles of the correction by the host.
-        adds_image: True if the network adds the image to the result (the global add), which the
-            host does in float.
-        last: pixel shuffles after the image was added. If the image has one channel and the sum
-            several, it is added to each of them.
         border_px: the number of pixels by which the network mirrors the image beyond its borders.
-        crop_px: the number of pixels of the result that the network cuts off at each side.
-        limits: the low and the high end to which the network clips the result; empty if it does
-            not.
-        activation: "Sigmoid" or "Tanh" of the result, in front of the add; empty for none.
-        base: the part of the image that is added.
     """
 
     graph: Graph = field(compare=False)
     channels: int = 1
-    front: tuple[Shuffle, ...] = ()
-    back: tuple[Shuffle, ...] = ()
-    adds_image: bool = True
-    last: tuple[Shuffle, ...] = ()
     border_px: int = 0
-    crop_px: int = 0
-    limits: tuple[float, ...] = ()
-    activation: str = ""
-    base: Base = THE_IMAGE
 
     @property
     def core_channels(self) -> int:
@@ -154,7 +135,9 @@ def cut(graph: Graph, channels: int, with_sum: bool = True) -> SplitNetwork:
             break
         front.append(first)
         graph = tuple(renamed(op, {first.output: IMAGE}) for op in graph if op is not first)
-    network = SplitNetwork(graph, channels, tuple(front), back, adds_image, last)
+    network = SplitNetwork(
+        graph, channels, front=tuple(front), back=back, adds_image=adds_image, last=last
+    )
     return replace(network, graph=_image_for_convolutions(graph, network.core_channels))
 
 

@@ -8,7 +8,7 @@ The encoding reads an image over its full scale.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from onnx import TensorProto
@@ -17,11 +17,10 @@ from beers_deploy.quant.graph import (
     CORRECTION,
     IMAGE,
     PLANES,
-    Shuffle,
     SplitNetwork,
     channels_of,
 )
-from beers_deploy.quant.graph.base import THE_IMAGE, Base
+from beers_deploy.quant.graph.host_steps import HostSteps
 from beers_deploy.quant.graph.writer import write_base, write_shuffle
 from beers_deploy.quant.host_part.input_encoding import ENCODED, IMAGE_SLICES, InputEncoding
 from beers_deploy.quant.host_part.output_decoding import DECODED, OutputDecoding, Plain
@@ -35,7 +34,7 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 @dataclass(frozen=True)
-class HostPart:
+class HostPart(HostSteps):
     """The computations on the host's processor before and after the integer core of an INT8
     network.
 
@@ -43,37 +42,19 @@ class HostPart:
         channels: the number of channels that the encoding reads: those of the image after the pixel
             unshuffles of `front`.
         outputs: the number of channels of the decoded result.
-        front: pixel unshuffles of the image, which come first.
-        back: pixel shuffles of the decoded result.
-        adds_image: if True, the image is added to the result. The sum of an image in [0, 1] is
-            clipped to that range.
-        last: pixel shuffles after the image was added.
         unit: the share of full scale that a decoded value of 1 stands for.
         encoding: turns the image into the int8 planes that the core reads.
         decoding: combines the copies of each channel that the core writes.
         input_ranges: the range (low, high) of each channel of the image; empty if all are in [0,
             1].
-        limits: low and high end to which a result is clipped; empty for none but the sum above.
-        crop_px: the number of pixels that are cut off at each side of the result, before the image
-            is added. The core computes them for the mirrored border.
-        activation: "Sigmoid" or "Tanh" of the decoded result; empty for none.
-        base: the part of the image that is added.
     """
 
     channels: int = 1
     outputs: int = 1
-    front: tuple[Shuffle, ...] = ()
-    back: tuple[Shuffle, ...] = ()
-    adds_image: bool = True
-    last: tuple[Shuffle, ...] = ()
     unit: float = 1.0
     encoding: InputEncoding = IMAGE_SLICES
     decoding: OutputDecoding = field(default_factory=Plain)
     input_ranges: Ranges = ()
-    limits: tuple[float, ...] = ()
-    crop_px: int = 0
-    activation: str = ""
-    base: Base = THE_IMAGE
 
     @classmethod
     def of(
@@ -88,21 +69,17 @@ class HostPart:
                 [0, 1].
         """
         channels = network.core_channels
+        steps = {step.name: getattr(network, step.name) for step in fields(HostSteps)}
+        # An image in [0, 1] is clipped when it is stored.
+        if network.limits == UNIT and not input_ranges:
+            steps["limits"] = ()
         return cls(
             channels,
             channels_of(network.graph, {IMAGE: channels})[CORRECTION],
-            network.front,
-            network.back,
-            network.adds_image,
-            network.last,
             encoding=image_encoding(network.border_px, input_ranges),
             decoding=decoding,
             input_ranges=input_ranges,
-            # An image in [0, 1] is clipped when it is stored.
-            limits=network.limits if input_ranges or network.limits != UNIT else (),
-            crop_px=network.crop_px,
-            activation=network.activation,
-            base=network.base,
+            **steps,
         )
 
     @property

@@ -168,7 +168,7 @@ def bank_host_part(scale: int, decoding: BankSum) -> HostPart:
     pixels = scale**2
     back = (Shuffle("shuffle", "", "", scale, True, False),) if scale > 1 else ()
     front = tuple(replace(shuffle.inverse, name="unshuffle") for shuffle in back)
-    return HostPart(pixels, pixels, front, back, encoding=BANK_SLICES, decoding=decoding)
+    return HostPart(pixels, pixels, front=front, back=back, encoding=BANK_SLICES, decoding=decoding)
 
 
 def bank_results(
