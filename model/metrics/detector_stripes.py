@@ -12,6 +12,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from beers_deploy.model.metrics.detector_lines import REACH, Blocks
+from beers_deploy.model.metrics.robust import robust_deviation
 
 PARITY_LINES = 63
 """Lines over which alternate lines are averaged; their pattern is `Phases`, and no gain of single
@@ -46,8 +47,6 @@ WHITE = -0.35
 """Correlation of neighbouring second differences: -2/3 for independent detectors; it was above -0.1
 for scenes.
 """
-MAD = 1.4826
-"""Standard deviation of Gaussian numbers over their median absolute deviation."""
 MAD_ERROR = 2.33
 """Relative standard error of a variance by the median absolute deviation of N numbers, times
 sqrt(N).
@@ -178,12 +177,11 @@ def _spread(gains: np.ndarray, errors: np.ndarray) -> tuple[float | None, float,
 
 def _covariance(first: np.ndarray, other: np.ndarray) -> tuple[float, float]:
     """Return a robust covariance (Gnanadesikan and Kettenring 1972) and its standard error."""
-    of_sum, of_difference = (
-        np.square(MAD * np.median(np.abs(values))) for values in (first + other, first - other)
-    )
+    of_sum = robust_deviation(first + other) ** 2
+    of_difference = robust_deviation(first - other) ** 2
     # Second differences of neighbouring lines are not independent, so half of their number counts.
     error = MAD_ERROR * np.hypot(of_sum, of_difference) / 4 / np.sqrt(max(len(first) / 2, 1))
-    return float(of_sum - of_difference) / 4, float(error)
+    return (of_sum - of_difference) / 4, float(error)
 
 
 def _single(

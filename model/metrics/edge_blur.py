@@ -27,6 +27,7 @@ from beers_deploy.model.metrics.edge_fit import (
     fit_blurs,
     fit_shape,
 )
+from beers_deploy.model.metrics.robust import robust_deviation
 from beers_deploy.profiles.instrument import MTF_NYQUIST_MAX
 
 SHAPES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0, 13.0)
@@ -185,8 +186,6 @@ FLOOR = 0.05
 """Least standard error of gamma: the error of the fit on edges along the grid (measured), 2.5 % of
 the MTF.
 """
-ROBUST = 1.4826
-"""The ratio of the standard deviation of normal values to their median absolute deviation."""
 LONE_ERROR = 0.1
 """Assumed scatter of gamma between edges if only one edge is known."""
 WORST = 1e12
@@ -282,7 +281,7 @@ def _of_shape(
         error = math.hypot(float(errors[0]), LONE_ERROR)
     else:
         off = np.abs(gammas - np.median(gammas))
-        inliers = off <= 3 * np.maximum(ROBUST * float(np.median(off)), errors)
+        inliers = off <= 3 * np.maximum(robust_deviation(off), errors)
         values = gammas[inliers]
         variances = errors[inliers] ** 2
         between = LONE_ERROR**2

@@ -28,8 +28,8 @@ from beers_deploy.model.metrics.mtf_basis import (
     solve,
 )
 from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.model.metrics.robust import robust_deviation
 from beers_deploy.model.metrics.uneven_edge import (
-    MAD,
     FittedEdge,
     fit_edge,
     normal_equations,
@@ -156,7 +156,7 @@ def measure_curve(edges: Sequence[Edge], generator: np.random.Generator) -> MtfC
     draws = _drawn(fitted, weights, generator)
     # Edges whose softness is not the others'; of two that differ, both.
     off = np.abs(values - float(np.median(values)))
-    scatter = MAD * float(np.median(off)) if len(fitted) > 3 else 0.0
+    scatter = robust_deviation(off) if len(fitted) > 3 else 0.0
     contradicts = (off > CONTRADICTION_DEVIATIONS * np.hypot(errors, scatter)) & (
         off > CONTRADICTION_PX
     )

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from beers_deploy.model.metrics.mtf_basis import PARTS, at_distances, responses, softened
+from beers_deploy.model.metrics.robust import robust_deviation
 
 HALF_PX = 8.0
 """The distance from the edge up to which pixels are fitted."""
@@ -40,8 +41,6 @@ HUBER = 2.5
 """The number of robust deviations from which a pixel is weighted less: cars, branches and drains
 lie next to edges.
 """
-MAD = 1.4826
-"""Standard deviation over the median absolute deviation, of normal values."""
 
 LEVELS = 6
 NUMBERS = 9
@@ -146,7 +145,7 @@ def fit_edge(
         share = at_distances(edge_table, distance_px)[:, None]
         by_levels = np.hstack([plane * (1 - share), plane * share])
         rest = values - by_levels @ levels
-        scale = max(MAD * float(np.median(np.abs(rest))), 1e-9)
+        scale = max(robust_deviation(rest), 1e-9)
         # Cars, branches and drains lie next to edges, so pixels with large residuals count less.
         huber = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(rest), 1e-9))
         # A residual beyond the noise is texture, which lowers the weight of the edge.
