@@ -31,10 +31,10 @@ from beers_deploy.model.levels import LEVELS, Level
 from beers_deploy.model.raster.images import list_images, site_of
 from beers_deploy.model.shipped import INT8, SHIPPED, shipped_names, shipped_weights
 from beers_deploy.model.simulator.acquire import (
-    MARGIN_PX,
     acquire_three,
     fitting_oversampling,
     prepare_scene,
+    scene_side_px,
 )
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import read_scene
@@ -127,7 +127,7 @@ def acquired(
     if ratio is None:
         return None
     if crop_px is not None:
-        side = (crop_px + 2 * MARGIN_PX) * ratio
+        side = scene_side_px(crop_px, ratio)
         top, left = (int(generator.integers(max(size - side, 0) + 1)) for size in scene.shape)
         scene = scene[top : top + side, left : left + side]
     aim = REFERENCE.in_units_of(sensor)

@@ -178,13 +178,12 @@ def _scene(
     ratio: int,
     draw: "Draw",
 ) -> "Scene":
-    from beers_deploy.model.simulator.acquire import MARGIN_PX
+    from beers_deploy.model.simulator.acquire import scene_side_px
     from beers_deploy.model.simulator.procedural import procedural_scene
     from beers_deploy.model.simulator.sampling import read_scene, scene_of
 
     if scene is None:
-        # The Fourier transform of the blur wraps around. The margin excludes the opposite border.
-        side_px = (size_px + 2 * MARGIN_PX) * ratio
+        side_px = scene_side_px(size_px, ratio)
         return procedural_scene(side_px, side_px, draw.generator("drawn scene"))
     if isinstance(scene, str | os.PathLike):
         return read_scene(Path(scene), sensor)

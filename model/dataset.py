@@ -29,7 +29,7 @@ from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.manifest import DIGESTS, ROLES, Line, image_of, line_text, matching_lines
 from beers_deploy.model.progress import steps
 from beers_deploy.model.raster.writer import write_tiff
-from beers_deploy.model.simulator.acquire import MARGIN_PX, prepare_scene, simulate_planned
+from beers_deploy.model.simulator.acquire import prepare_scene, scene_side_px, simulate_planned
 from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.plan import TOLERANCE_DN, make_plan
 from beers_deploy.model.simulator.procedural import procedural_scene
@@ -114,7 +114,7 @@ def plan_windows(recipe: DatasetRecipe) -> list[Window]:
             small.append(path)
         windows += scene_windows
     if small:
-        side = ((recipe.patch_px or 1) + 2 * MARGIN_PX) * recipe.oversampling
+        side = scene_side_px(recipe.patch_px or 1, recipe.oversampling)
         side = math.ceil(side / recipe.scene_scale)
         if small == [None]:
             raise ImageError(
@@ -135,10 +135,10 @@ def _scene_windows(recipe: DatasetRecipe, index: int, first: int) -> Iterator[Wi
     height, width = load(recipe, index).radiance.shape
     stem = f"{index:04d}-{path.stem if path else 'drawn'}"
     if recipe.patch_px is None:
-        if min(height, width) // ratio > 2 * MARGIN_PX:
+        if min(height, width) >= scene_side_px(1, ratio):
             yield Window(first, index, stem, 0, 0, height, width)
         return
-    side = (recipe.patch_px + 2 * MARGIN_PX) * ratio
+    side = scene_side_px(recipe.patch_px, ratio)
     step = recipe.patch_px * ratio
     tops = range(0, height - side + 1, step)
     lefts = range(0, width - side + 1, step)

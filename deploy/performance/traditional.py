@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 import torch
 
-from beers_deploy.model.simulator.acquire import MARGIN_PX, simulate_pair
+from beers_deploy.model.simulator.acquire import scene_side_px, simulate_pair
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.traditional.pipeline import TraditionalPipeline, restore_traditional
@@ -116,8 +116,7 @@ def drawn_acquisition(
     """
     ratio = int(degraded.oversampling.low)
     sides = min(swath.height_px, CROP_PX), min(swath.width_px, CROPS * CROP_PX)
-    # The simulator cuts a margin off each side, which keeps the wrap of its Fourier transform out.
-    height, width = ((side + 2 * MARGIN_PX) * ratio for side in sides)
+    height, width = (scene_side_px(side, ratio) for side in sides)
     scene = procedural_scene(height, width, np.random.default_rng(seed))
     pair = simulate_pair(scene.radiance, degraded.nominal(), reference.nominal(), ratio, Draw(seed))
     return pair.degraded

@@ -13,7 +13,7 @@ from beers_deploy.model.io.pictures import busiest_windows, picture_url, stretch
 from beers_deploy.model.metrics.fidelity import fidelity_db, ssim
 from beers_deploy.model.raster.images import read_acquisition, read_pixels
 from beers_deploy.model.shipped import VARIANT
-from beers_deploy.model.simulator.acquire import MARGIN_PX, Pair, simulate_pair
+from beers_deploy.model.simulator.acquire import Pair, scene_side_px, simulate_pair
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import read_scene
@@ -131,8 +131,7 @@ def read_input(
     degraded, reference = (profile.nominal() for profile in sensors)
     ratio = int(sensors[0].oversampling.low)
     if image is None:
-        # The simulator cuts a margin off each side, where its Fourier transform wraps around.
-        side = (SIDE_PX + 2 * MARGIN_PX) * ratio
+        side = scene_side_px(SIDE_PX, ratio)
         scene = procedural_scene(side, side, np.random.default_rng(seed))
     elif full_scale is None and read_pixels(image).dtype == np.uint8:
         scene = read_scene(image, reference)

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from beers_deploy.model.io.pictures import Stretch, strip
-from beers_deploy.model.simulator.acquire import MARGIN_PX, prepare_scene, simulate_planned
+from beers_deploy.model.simulator.acquire import prepare_scene, scene_side_px, simulate_planned
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.plan import ORDER, TOLERANCE_DN, make_plan, scene_stats
 from beers_deploy.model.simulator.procedural import procedural_scene
@@ -79,7 +79,7 @@ def plain() -> Instrument:
 
 def figure() -> Image.Image:
     """Draw a grid of crops: without optional effects, with each alone, and with all."""
-    side = (SIDE_PX + 2 * MARGIN_PX) * RATIO
+    side = scene_side_px(SIDE_PX, RATIO)
     radiance = procedural_scene(3520, 3520, np.random.default_rng(0)).radiance
     scene = prepare_scene(radiance[2000 : 2000 + side, 2300 : 2300 + side], RATIO)
     typical = settled(typical_effects(), lambda constant: constant.middle)

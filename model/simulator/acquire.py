@@ -206,10 +206,18 @@ def fitting_oversampling(
         oversamplings: the candidates, in order of preference.
         side_px: the smallest side, in pixels, that an image must keep within its margins.
     """
-    target_px = side_px + 2 * MARGIN_PX
-    return next(
-        (ratio for ratio in oversamplings if min(radiance.shape) // ratio >= target_px), None
-    )
+    shorter_px = min(radiance.shape)
+    return next((r for r in oversamplings if scene_side_px(side_px, r) <= shorter_px), None)
+
+
+def scene_side_px(side_px: int, oversampling: int) -> int:
+    """Return the side in scene pixels of a scene from which an image of a side is simulated.
+
+    Args:
+        side_px: the side of the image, in pixels.
+        oversampling: the number of scene pixels per pixel of the image, along each side.
+    """
+    return (side_px + 2 * MARGIN_PX) * oversampling
 
 
 def crop_margin(image: Pixels, margin_px: int) -> Pixels:

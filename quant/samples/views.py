@@ -15,7 +15,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from beers_deploy.model.simulator.acquire import MARGIN_PX
+from beers_deploy.model.simulator.acquire import MARGIN_PX, scene_side_px
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.training.patches import PatchRecipe
 from beers_deploy.profiles.errors import ImageError
@@ -204,11 +204,10 @@ def stratified(
 
 def _places(scenes: Sequence[Scene], recipe: PatchRecipe) -> list[tuple[Scene, int]]:
     """Return scenes, each with every oversampling at which it holds a patch."""
-    side_px = recipe.patch_px + 2 * MARGIN_PX
     fitting = [
         (scene, ratio)
         for scene, ratio in product(scenes, recipe.oversamplings)
-        if min(scene.radiance.shape) >= side_px * ratio
+        if min(scene.radiance.shape) >= scene_side_px(recipe.patch_px, ratio)
     ]
     if not fitting:
         raise ImageError(

@@ -164,7 +164,7 @@ def simulate_pairs(
             NamedPair(scene.name, degraded_dn, reference_dn, oversampling=ratio, noise_free=clean)
         )
     if not pairs:
-        least = oversamplings[-1] * (2 * acquire.MARGIN_PX + acquire.LEAST_SIDE_PX)
+        least = acquire.scene_side_px(acquire.LEAST_SIDE_PX, oversamplings[-1])
         raise ImageError(
             f"The scenes in `images` must have {least} pixels a side or more, but none "
             f"of {len(small)} has. Give larger images."
