@@ -1,8 +1,8 @@
 """Fit the convolutions around replaced activations to the original network, without training.
 
 1. HardSwish and HardSigmoid approximate SiLU and Sigmoid better over scaled ranges. Each channel
-   gets the factor k with which a line through HardSwish(k x), or HardSigmoid(k x), is nearest to
-   the original. The convolutions in front and behind are multiplied by k and 1 / k.
+   gets the factor k with which HardSigmoid(k x), or a line through HardSwish(k x), is nearest to
+   the original. The convolution in front is multiplied by k, and those behind HardSwish by 1 / k.
 2. Each convolution that reads changed tensors is fitted in order, by least squares. From the
    adapted network's tensors it computes approximately what it computed from the original ones. That
    includes a scale for each channel, the correction of the bias, and the remaining error of the
@@ -218,7 +218,12 @@ def _best_factors(is_swish: bool, source: np.ndarray, result: np.ndarray) -> np.
     centred = result - result.mean(1, keepdims=True)
     for factor in FACTORS:
         scaled = source * np.float32(factor)
-        candidate = np.clip(scaled / 6 + 0.5, 0, 1) * (scaled if is_swish else 1)
+        candidate = np.clip(scaled / 6 + 0.5, 0, 1)
+        # A gate multiplies another map, so no convolution behind can add the offset of a line.
+        if not is_swish:
+            residuals.append(np.square(candidate - result).mean(1))
+            continue
+        candidate = candidate * scaled
         candidate = candidate - candidate.mean(1, keepdims=True)
         variance = np.maximum(np.square(candidate).mean(1), np.finfo(np.float32).tiny)
         # The part of the variance that a line through the candidate explains; the rest is the same
