@@ -156,6 +156,17 @@ def test_each_rule_refuses_its_case_alone_and_following_the_remedy_passes(rule: 
     ("rules", "nodes", "channels"),
     [
         (["conv channels"], "y = Conv(image, w4097x8x1x1)", 8),
+        (["conv channels"], "y = Conv(image, w8x4097x1x1)", 4097),
+        # A dilation counts times the input channels, whatever the output channels.
+        (["conv dilation"], "y = Conv<dilations=[3,1], pads=[3,0,3,0]>(image, w8x1366x3x1)", 1366),
+        ([], "y = Conv<dilations=[3,1], pads=[3,0,3,0]>(image, w1366x8x3x1)", 8),
+        # Beyond 2048 input channels a window takes twice its positions.
+        (
+            ["conv weight bank", "conv window"],
+            "y = Conv<pads=[2,2,3,3]>(image, w8x2049x6x6)",
+            2049,
+        ),
+        (["conv weight bank"], "y = Conv<pads=[2,2,3,3]>(image, w2049x2048x6x6)", 2048),
         (["conv weight bank"], "y = Conv<pads=[3,3,3,3]>(image, w1x2048x8x8)", 2048),
         (["transposed channels"], "y = ConvTranspose(image, w8x4097x1x1)", 8),
         (
@@ -180,7 +191,8 @@ def test_each_rule_refuses_its_case_alone_and_following_the_remedy_passes(rule: 
 )
 def test_wide_layers(rules: list[str], nodes: str, channels: int) -> None:
     """A layer of too many channels or weights is refused by the rule about its own kind alone."""
-    assert broken_rules(written(nodes, channels)) == rules
+    with as_written():
+        assert broken_rules(written(nodes, channels)) == rules
 
 
 ENLARGED = f"""

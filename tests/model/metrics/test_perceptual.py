@@ -121,6 +121,20 @@ def test_dead_features_keep_the_gradient_finite(size: float, metric: Lpips | Dis
     assert value.isfinite().all()
 
 
+@pytest.mark.parametrize("name", STEMS)
+def test_only_the_direction_of_features_counts(name: str, folder: Path) -> None:
+    """Features a thousand times smaller give the same distance: each pixel's are normalised."""
+    metric = load(name, folder)
+    for key, parameter in metric.backbone.named_parameters():
+        if key.endswith("bias"):
+            parameter.data.zero_()
+    images = pair(40, 40)
+    distance = float(metric(*images))
+    first = next(metric.backbone.parameters())
+    first.data.mul_(1e-3)
+    assert float(metric(*images)) == pytest.approx(distance, rel=1e-3)
+
+
 @pytest.mark.parametrize(("network", "smallest"), [("squeeze", 17), ("vgg", 16), ("dists", 16)])
 def test_the_smallest_image(network: str, smallest: int, folder: Path) -> None:
     metric = load(network, folder)
