@@ -199,6 +199,11 @@ def test_noise_in_both_ways_is_refused_by_replace() -> None:
         Sensor.load("pleiades-degraded").replace(alpha=1.0, snr_0=3.0)
 
 
+def test_a_number_that_defines_the_pixels_may_not_be_a_range() -> None:
+    with pytest.raises(ProfileError, match="must be one number, but it is the range 10 to 12"):
+        Sensor.load("pleiades-degraded").replace(bits=(10, 12))
+
+
 @pytest.mark.parametrize("kind", [np.float32, np.float64, np.int64])
 def test_a_number_of_numpy_replaces_one_of_a_sensor(kind: type) -> None:
     sensor = Sensor.load("pleiades-degraded").replace(snr_1=kind(100), snr_0=(kind(40), kind(45)))

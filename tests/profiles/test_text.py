@@ -89,6 +89,11 @@ def test_hostile_json_is_a_value_error(name: str) -> None:
         parse_json(BAD_JSON[name])
 
 
+def test_a_key_that_is_there_twice_is_named() -> None:
+    with pytest.raises(ValueError, match="it has the key 'b' twice"):
+        parse_json('{"a": 1, "b": 2, "b": 2}')
+
+
 @given(
     st.recursive(
         st.none() | st.booleans() | st.integers(-(10**9), 10**9) | st.text(),

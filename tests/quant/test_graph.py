@@ -16,8 +16,10 @@ from beers_deploy.quant.graph import (
     Resize,
     correction_graph,
     read_network,
+    same,
 )
 from beers_deploy.quant.host_part import IMAGE_SLICES
+from beers_deploy.quant.onnx.image_input import require_image
 from tests.quant.quick import behind_conv, copied, run_model, uniform
 from tests.quant.simplify.networks import parsed
 
@@ -149,3 +151,16 @@ def test_two_inputs_or_outputs_are_refused_by_name(
     getattr(model.graph, end).append(info)
     with pytest.raises(ModelError, match=message):
         read_network(model)
+
+
+@pytest.mark.parametrize("sizes", [(1, 3, 8), (2, 3, 8, 8), (1, 1, 3, 8, 8)])
+def test_an_input_of_several_images_or_other_dimensions_is_refused(sizes: tuple[int, ...]) -> None:
+    with pytest.raises(ModelError, match="one image"):
+        require_image("image", sizes)
+    require_image("image", (1, 3, 8, 8))
+
+
+def test_the_window_of_an_oblong_kernel_keeps_the_size() -> None:
+    window = same(np.zeros((1, 1, 3, 7)))
+    sides = [window.output_size(axis, side, 20) for axis, side in enumerate((3, 7))]
+    assert sides == [20, 20]

@@ -138,6 +138,14 @@ def test_nan_never_holds_and_is_the_worst() -> None:
     assert not Measure("c", float("inf"), 1).holds
 
 
+def test_a_single_pixel_that_differs_fails_and_missing_ones_are_equal() -> None:
+    image = np.full((3, 4), np.nan)
+    other = image.copy()
+    assert differing("c", image, other).holds
+    other[1, 2] = 0
+    assert not differing("c", image, other).holds
+
+
 def test_a_limitation_explains_no_more_than_its_ceiling() -> None:
     limit = next(limitation for limitation in LIMITATIONS if limitation.name == "border")
     for value, failed in ((limit.ceiling, 0), (limit.ceiling + 1, 1), (float("nan"), 1)):

@@ -156,3 +156,12 @@ def test_a_mosaic_of_unequal_channels_is_refused() -> None:
     outcome = fit_noise(cut_blocks(generator.poisson(channels), MAX_DN), incomplete=True)
     assert isinstance(outcome, Refusal)
     assert "mosaic" in outcome.reason
+
+
+def test_parts_of_different_images_have_different_numbers() -> None:
+    """The interval counts parts. Two images that share a number would count as one."""
+    generator = np.random.default_rng(0)
+    images = [100 + generator.normal(0, 5, (150, side)) for side in (90, 200)]
+    blocks = [cut_blocks(image, 4095) for image in images]
+    first, second = (set(each.part.tolist()) for each in blocks)
+    assert len(set(join(blocks).part.tolist())) == len(first) + len(second)
