@@ -33,6 +33,7 @@ from beers_deploy.profiles.errors import OptionError, encodable, printable, reas
 from beers_deploy.profiles.figures import Check
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.profiles.toml import read_json
+from beers_deploy.quant.encodings import as_on_board
 from beers_deploy.quant.float_parts import float_note
 from beers_deploy.quant.gate import GateResult, unfit_reference
 from beers_deploy.quant.limits import Limits, judge, not_judged
@@ -366,7 +367,8 @@ def file_checks(
     if not (target.configurations or target.npu):
         return checks
     with faults_named(int8.label):
-        graph = network_of(int8.model, usual_tile_px(int8.model), int8.name)
+        core = as_on_board(int8.model)
+        graph = network_of(core, usual_tile_px(core), int8.name)
     return [legality(place(graph, device_of(target)), npu=bool(target.npu)), *checks]
 
 

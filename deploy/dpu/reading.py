@@ -74,8 +74,11 @@ def own_tile_px(model: onnx.ModelProto) -> int | None:
 def usual_tile_px(model: onnx.ModelProto) -> int:
     """Return the side in pixels of the image that a network is fixed to; else the smallest side of
     at least TILE_PX whose pixels the host can move into channels.
+
+    Args:
+        model: a float network, or an INT8 one as `as_on_board` returns it.
     """
-    place_px, border_px = _places(as_on_board(model))
+    place_px, border_px = _places(model)
     whole_px = place_px * -(-(TILE_PX + 2 * border_px) // place_px)
     return own_tile_px(model) or whole_px - 2 * border_px
 

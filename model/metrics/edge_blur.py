@@ -123,7 +123,9 @@ def plain_squares(
     left = squares[:, :, :3]
     right = squares[:, :, -3:]
     step = np.abs(right.mean((1, 2)) - left.mean((1, 2)))
-    scatter = [_scatter(side) - noise(side).mean((1, 2)) for side in (left, right)]
+    scatter = [
+        side.var(axis=1, ddof=1).mean(1) - noise(side).mean((1, 2)) for side in (left, right)
+    ]
     flat = np.sqrt(np.maximum(np.maximum(*scatter), 0)) < roughness * step
     plain: np.ndarray = squares[valid & flat]
     return plain[: effort.fits]
@@ -172,13 +174,6 @@ def _steepness(image: np.ndarray, noise: Noise, step_px: int) -> np.ndarray:
     # A mean of 5 rows less another one has 2 / 5 of a pixel's variance.
     deviation = np.sqrt(2 / 5 * noise(column(row(0), 0)))
     return np.where(down > across, 0, across / deviation)
-
-
-def _scatter(side: np.ndarray) -> np.ndarray:
-    """Return the mean variance (N,) of the columns of (N, H, W)."""
-    height, width = side.shape[1:]
-    off = side - side.mean(1, keepdims=True)
-    return np.asarray(np.einsum("nij,nij->n", off, off) / ((height - 1) * width))
 
 
 MIN_EDGES = 3

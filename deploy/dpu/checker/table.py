@@ -19,7 +19,7 @@ from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.figures import Check, Figure, Row, predicted, unavailable
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.quant.encodings import implicit_parts
+from beers_deploy.quant.encodings import as_on_board, implicit_parts
 from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.graph import refusal
 from beers_deploy.quant.onnx.image_input import fixed_tile_px
@@ -101,8 +101,9 @@ def check_network(
     if output is not None:
         source = source.with_output(output)
     build = device_of(target, dpu)
-    tile_px = usual_tile_px(source.model) if tile is None else tile
-    sized = network_of(source.model, tile_px, source.label)
+    core = as_on_board(source.model)
+    tile_px = usual_tile_px(core) if tile is None else tile
+    sized = network_of(core, tile_px, source.label)
     placement = place(sized, build)
     npu = bool(target.npu)
     checks = [legality(placement, npu=npu), *(_file_checks(source.model, build) if npu else [])]
