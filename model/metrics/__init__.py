@@ -8,5 +8,5 @@
   return a `refusal` rather than guess;
 - faults of single detectors: `detector_lines` and `detector_stripes`, `detector_phases`,
   `detector_pixels`;
-- `bootstrap` estimates the uncertainty of a mean over images.
+- `statistics` estimates the uncertainty of a mean over images, and spreads despite outliers.
 """

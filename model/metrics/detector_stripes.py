@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from beers_deploy.model.metrics.detector_lines import REACH, Blocks
-from beers_deploy.model.metrics.robust import robust_deviation
+from beers_deploy.model.metrics.statistics import robust_deviation
 
 PARITY_LINES = 63
 """Lines over which alternate lines are averaged; their pattern is `Phases`, and no gain of single

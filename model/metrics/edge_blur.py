@@ -27,7 +27,7 @@ from beers_deploy.model.metrics.edge_fit import (
     fit_blurs,
     fit_shape,
 )
-from beers_deploy.model.metrics.robust import robust_deviation
+from beers_deploy.model.metrics.statistics import robust_deviation
 from beers_deploy.profiles.instrument import MTF_NYQUIST_MAX
 
 SHAPES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0, 13.0)

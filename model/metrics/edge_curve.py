@@ -28,7 +28,7 @@ from beers_deploy.model.metrics.mtf_basis import (
     solve,
 )
 from beers_deploy.model.metrics.refusal import Refusal
-from beers_deploy.model.metrics.robust import robust_deviation
+from beers_deploy.model.metrics.statistics import robust_deviation
 from beers_deploy.model.metrics.uneven_edge import (
     FittedEdge,
     fit_edge,

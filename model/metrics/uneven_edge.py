@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from beers_deploy.model.metrics.mtf_basis import PARTS, at_distances, responses, softened
-from beers_deploy.model.metrics.robust import robust_deviation
+from beers_deploy.model.metrics.statistics import robust_deviation
 
 HALF_PX = 8.0
 """The distance from the edge up to which pixels are fitted."""

@@ -39,7 +39,7 @@ from beers_deploy.model.training.trainer import Batches, Precision, Schedule, Tr
 from beers_deploy.model.training.validation import Validation, split_by_site, write_picture
 from beers_deploy.model.variants import variant_named
 from beers_deploy.profiles.errors import ModelError, OptionError
-from beers_deploy.profiles.sensor_numbers import numbers_of
+from beers_deploy.profiles.sensor import numbers_of
 
 logger = logging.getLogger(__name__)
 

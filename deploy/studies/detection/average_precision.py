@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_array
 
-from beers_deploy.model.metrics.bootstrap import LEAST_SITES, percentiles, too_few
+from beers_deploy.model.metrics.statistics import LEAST_SITES, percentiles, too_few
 from beers_deploy.profiles.errors import counted
 from beers_deploy.studies.detection.boxes import Boxes, areas, iou
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.model.metrics.bootstrap import too_few
+from beers_deploy.model.metrics.statistics import too_few
 from beers_deploy.profiles.errors import counted
 from beers_deploy.profiles.figures import Figure, Row, measured, published, unavailable
 from beers_deploy.results import Table

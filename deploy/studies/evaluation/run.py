@@ -24,7 +24,7 @@ from beers_deploy.model.io.pictures import (
     stretch_of,
     strip_row,
 )
-from beers_deploy.model.metrics.bootstrap import too_few
+from beers_deploy.model.metrics.statistics import too_few
 from beers_deploy.model.pairs_recipe import read_pairs_recipe
 from beers_deploy.model.raster.images import list_images
 from beers_deploy.network import Network, NetworkLike

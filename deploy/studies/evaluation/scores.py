@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from beers_deploy.model.metrics.bootstrap import site_interval
 from beers_deploy.model.metrics.fidelity import fidelity_db, ssim
 from beers_deploy.model.metrics.perceptual import Dists, Lpips, find_backbone, not_found
+from beers_deploy.model.metrics.statistics import site_interval
 from beers_deploy.model.progress import steps
 from beers_deploy.profiles.errors import counted
 from beers_deploy.profiles.figures import Figure, Row, measured, published, unavailable

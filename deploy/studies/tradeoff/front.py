@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from beers_deploy.model.metrics.bootstrap import site_interval
+from beers_deploy.model.metrics.statistics import site_interval
 from beers_deploy.network import Network
 from beers_deploy.performance.swath import interval_ends
 from beers_deploy.profiles.errors import OptionError

@@ -14,8 +14,8 @@ from typing import cast
 
 from beers_deploy.dpu.board import dpu_of
 from beers_deploy.dpu.cost.model import Constants
-from beers_deploy.model.metrics.bootstrap import too_few
 from beers_deploy.model.metrics.perceptual import find_backbone
+from beers_deploy.model.metrics.statistics import too_few
 from beers_deploy.model.progress import steps
 from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.traditional.baselines import BASELINES

@@ -1,6 +1,6 @@
 import numpy as np
 
-from beers_deploy.model.metrics.bootstrap import LEAST_SITES, site_interval
+from beers_deploy.model.metrics.statistics import LEAST_SITES, site_interval
 
 
 def interval(values: list[float], sites: list[str]) -> tuple[float, float]:

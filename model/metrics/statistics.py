@@ -1,4 +1,6 @@
-"""Estimate the uncertainty of a mean over images by a bootstrap over their sites."""
+"""Estimate the uncertainty of a mean over images by a bootstrap over their sites, and the spread of
+numbers with outliers.
+"""
 
 from collections.abc import Sequence
 
@@ -64,3 +66,9 @@ def too_few(sites: int) -> str:
         f"No interval over sites is shown: of {sites}, fewer than {LEAST_SITES}, none could "
         "be trusted."
     )
+
+
+def robust_deviation(residuals: np.ndarray) -> float:
+    """Return the standard deviation of numbers that are normal around 0, but for some outliers."""
+    # The standard deviation of normal numbers is 1.4826 times their median absolute deviation.
+    return 1.4826 * float(np.median(np.abs(residuals)))
