@@ -14,8 +14,7 @@ from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.shipped import INT8, VARIANT, shipped_weights
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import ImageError, OptionError, counted
-from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_numbers import numbers_of
+from beers_deploy.profiles.sensor import Sensor, numbers_of
 from beers_deploy.quant.encodings import CORE
 from beers_deploy.quant.gate import GateResult, gate_row
 from beers_deploy.quant.gate import compare as differences_of

@@ -4,7 +4,8 @@ It imports nothing of this project, and exports no names itself, so that `--help
 NumPy.
 
 - `sensor`, `scene_call`: sensors and scenes, each a pydantic model with its short TOML file;
-  `sensor_file`: the tables of a sensor's file; `reference`: the sensor that a restoration aims at;
+  `sensor_file`: the tables of a sensor's file; `sensor_checks`: that one instrument can have its
+  numbers; `reference`: the sensor that a restoration aims at;
 - `instrument`, `effects`, `response`: the physics: noise, effects, and a blur that is given by a
   table or a point-spread function; `point_spread_file`: a point-spread function as a .npy file;
 - `target`: processing boards, in `targets/`; `target_limits`: the valid numbers of a board;

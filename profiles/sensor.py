@@ -20,12 +20,17 @@ from beers_deploy.profiles.errors import ProfileError, as_path, counted, require
 from beers_deploy.profiles.instrument import (
     OFFSET,
     Instrument,
-    mtf_limit,
     noise_from_snr,
     snr_0_bounds,
     with_offset_of,
 )
 from beers_deploy.profiles.response import MtfTable, Response, unpacked
+from beers_deploy.profiles.sensor_checks import (
+    impossible_snr,
+    require_possible_blur,
+    require_possible_noise,
+    require_possible_offset,
+)
 from beers_deploy.profiles.sensor_file import (
     GROUPS,
     LEAST,
@@ -99,75 +104,12 @@ class Sensor:
     response: Response | None = None
 
     @model_validator(mode="after")
-    def _noise_is_possible(self) -> Self:
-        """Raise ValueError if the noise is stated in neither way or in both, or is physically
-        impossible.
-        """
-        ways = [self.snr_0, self.snr_1], [self.alpha, self.beta]
-        begun = [way for way in ways if any(way)]
-        if len(begun) != 1 or not all(begun[0]):
-            raise ValueError(
-                "noise must have snr_0 and snr_1, or alpha and beta. Give two of them."
-            )
-        dark = self.radiance_0.low
-        bright = self.radiance_1.low
-        if not dark < bright:
-            raise ValueError(
-                f"noise.radiance_0 must be below radiance_1, {bright:g} W/m2/sr/um, but it is "
-                f"{dark:g}. Name the darker of the two points radiance_0."
-            )
-        if self.alpha and self.beta and max(self.alpha.high, self.beta.high) < LEAST:
-            raise ValueError(
-                "noise.alpha and noise.beta must not both be 0. Give the variance in the dark as "
-                "beta."
-            )
-        if self.snr_0 and self.snr_1:
-            # Both bounds grow with snr_1, so it suffices to check its two ends.
-            lowest = snr_0_bounds(dark, bright, self.snr_1.low)[0]
-            highest = snr_0_bounds(dark, bright, self.snr_1.high)[1]
-            if self.snr_0.high < lowest or self.snr_0.low > highest:
-                raise ValueError(self._impossible_snr())
-        return self
-
-    @model_validator(mode="after")
-    def _blur_is_possible(self) -> Self:
-        """Raise ValueError if the response contradicts the contrasts, or if they exceed the
-        anti-alias filter.
-        """
-        axes = self.contrasts
-        if self.response and not np.allclose([c.low for c in axes], self.response.at_nyquist):
-            raise ValueError(
-                f"mtf has the contrasts {axes[0]} and {axes[1]} at Nyquist, but the "
-                f"{self.response} has others. Generate the file again."
-            )
-        if "antialias" not in self.effects:
-            return self
-        if self.response:
-            raise ValueError(
-                f"must have no table antialias, because the {self.response} already includes the "
-                "filter. Remove the table, or the effect from the scene or the option that adds it."
-            )
-        sigma = self.effects["antialias"]["sigma_px"]
-        limit = mtf_limit(sigma.high)
-        for key, mtf in zip(("mtf_nyquist", "mtf_nyquist_along"), axes, strict=True):
-            if mtf.high > limit:
-                raise ValueError(
-                    f"mtf.{key} must be at most {limit:.4g}, which an anti-alias filter of "
-                    f"{sigma.high:g} px leaves, but it is {mtf}. Lower one of the two."
-                )
-        return self
-
-    @model_validator(mode="after")
-    def _offset_is_possible(self) -> Self:
-        """Raise ValueError if the offset alone saturates every pixel."""
-        largest_dn = 2**self.bits.low - 1
-        offset_dn = self.units[2]
-        if offset_dn >= largest_dn:
-            raise ValueError(
-                f"offset.offset_dn must be below {largest_dn:g}, the largest digital number of "
-                f"{counted(int(self.bits.low), 'bit')}, but it is {offset_dn:g}. Correct one of "
-                "the two."
-            )
+    def _is_possible(self) -> Self:
+        """Raise ValueError if no instrument can have these numbers."""
+        require_possible_noise(self._radiances, (self.snr_0, self.snr_1), (self.alpha, self.beta))
+        require_possible_blur(self.contrasts, self.response, self.effects)
+        _, bits, offset_dn = self.units
+        require_possible_offset(int(bits), offset_dn)
         return self
 
     @classmethod
@@ -358,7 +300,8 @@ class Sensor:
             alpha, beta = self._noise(number(snr_0), number(snr_1))
             if alpha >= 0 and beta >= 0:
                 return (alpha, beta), rejected
-        raise ProfileError(f"The sensor profile {self.name} {self._impossible_snr()}")
+        fault = impossible_snr(self._radiances, self.snr_pair)
+        raise ProfileError(f"The sensor profile {self.name} {fault}")
 
     def nominal(self) -> Instrument:
         """Return the instrument in the middle of every range.
@@ -381,6 +324,10 @@ class Sensor:
 
     def _noise(self, snr_0: float, snr_1: float) -> tuple[float, float]:
         return noise_from_snr(self.radiance_0.low, snr_0, self.radiance_1.low, snr_1)
+
+    @property
+    def _radiances(self) -> tuple[Constant, Constant]:
+        return self.radiance_0, self.radiance_1
 
     @property
     def snr_pair(self) -> tuple[Constant, Constant]:
@@ -411,21 +358,34 @@ class Sensor:
             self.response,
         )
 
-    def _impossible_snr(self) -> str:
-        """Return the error message for SNRs that no alpha and beta can have."""
-        snr_0, snr_1 = self.snr_pair
-        low, high = snr_0_bounds(self.radiance_0.low, self.radiance_1.low, snr_1.high)
-        return (
-            f"noise.snr_0, at {self.radiance_0} W/m2/sr/um, must be {low:g} to {high:g} with "
-            f"noise.snr_1 = {snr_1.high:g} at {self.radiance_1} (variance alpha L + beta with "
-            f"alpha, beta >= 0), but it is {snr_0}. Correct one of the two; both are linear "
-            "ratios, not dB."
-        )
-
 
 def _stated(value: object, contrast: Constant) -> Stated:
     """Return a part of the response with the provenance of its contrast."""
     return Stated(value, contrast.status, contrast.source)
+
+
+def same_instrument(one: Sensor, other: Sensor) -> bool:
+    """Return True if two profiles state the same numbers, and so produce the same images; names and
+    sources may differ.
+    """
+    return numbers_of(one) == numbers_of(other)
+
+
+def numbers_of(profile: Sensor) -> dict[str, object]:
+    """Return the numbers of a profile in a form that can be compared.
+
+    Returns:
+        From the name of each constant to its (low, high) ends, or None if the profile lacks it; the
+        key "response" has the complete blur as text.
+    """
+    constants: dict[str, Constant | None] = {key: getattr(profile, key) for key in TABLE_OF}
+    for effect, table in profile.effects.items():
+        constants |= {f"{effect}.{key}": constant for key, constant in table.items()}
+    numbers: dict[str, object] = {
+        key: constant and (constant.low, constant.high) for key, constant in constants.items()
+    }
+    # The representation contains all samples. The text of a response only contains a digest.
+    return {**numbers, "response": repr(profile.response)}
 
 
 SensorLike = Sensor | str | os.PathLike[str]

@@ -27,7 +27,7 @@ from beers_deploy.model.raster.writer import cog_bytes, padded_px, require_codec
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import BeersError, ImageError, MachineError, OptionError
 from beers_deploy.profiles.figures import Figure, Row, measured
-from beers_deploy.profiles.sensor_numbers import numbers_of
+from beers_deploy.profiles.sensor import numbers_of
 from beers_deploy.restoration.bands import in_order
 from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.cluster import open_cluster

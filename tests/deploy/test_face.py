@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import beers_deploy as bd
 from beers_deploy.model.shipped import shipped_names
-from beers_deploy.profiles.sensor_numbers import numbers_of
+from beers_deploy.profiles.sensor import numbers_of
 from beers_deploy.profiles.shipped import board_names, sensor_names
 from tests.deploy.documents import valid
 from tests.deploy.restoration.runs import simulated

@@ -25,8 +25,7 @@ from beers_deploy.model.shipped import (
 from beers_deploy.network import Network
 from beers_deploy.network_files import int8_for_sensor, other_sensor, weights_file
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_numbers import numbers_of
+from beers_deploy.profiles.sensor import Sensor, numbers_of
 from beers_deploy.profiles.shipped import BLIND, BLIND_PROFILE
 from beers_deploy.quant.onnx_file import load_onnx, metadata
 from beers_deploy.quant.sensor_bank import calibrate

@@ -12,8 +12,7 @@ from PIL import Image
 from beers_deploy.model.dataset import DatasetRecipe, write_dataset
 from beers_deploy.model.pairs_recipe import profiles_for, read_pairs_recipe
 from beers_deploy.profiles.errors import OptionError, ProfileError
-from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_numbers import same_instrument
+from beers_deploy.profiles.sensor import Sensor, same_instrument
 from beers_deploy.profiles.shipped import sensor_names
 from beers_deploy.profiles.validation import validated
 from beers_deploy.studies.evaluation.pairs import oversamplings_of, read_pairs

@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 
 from beers_deploy.cli.commands import app
 from beers_deploy.profiles.response import MtfTable, PointSpread, centroid, packed, unpacked
-from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_numbers import same_instrument
+from beers_deploy.profiles.sensor import Sensor, same_instrument
 from beers_deploy.profiles.validation import validated
 from beers_deploy.shipped_tables import kind_and_table
 from tests.profiles.own_sensor import SHIPPED, own_sensor

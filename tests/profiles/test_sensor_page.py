@@ -12,9 +12,8 @@ import pytest
 from beers_deploy.profiles.constant import Constant, Status
 from beers_deploy.profiles.effects import TABLES as EFFECTS
 from beers_deploy.profiles.instrument import MTF_NYQUIST_MAX
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Sensor, same_instrument
 from beers_deploy.profiles.sensor_file import TABLE_OF, TABLES, table_keys
-from beers_deploy.profiles.sensor_numbers import same_instrument
 from beers_deploy.profiles.shipped import sensor_names
 from beers_deploy.profiles.validation import validated
 from tests.deploy.command_line import done
