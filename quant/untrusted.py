@@ -141,24 +141,36 @@ def held_tensors(graph: GraphProto) -> Iterator[TensorProto]:
 
 
 def _check_tensor(tensor: TensorProto, where: str) -> None:
-    _check_place_and_type(tensor, where)
+    name = printable(repr(tensor.name))
+    if tensor.data_location == TensorProto.EXTERNAL or tensor.external_data:
+        places = {entry.key: entry.value for entry in tensor.external_data}
+        place = printable(repr(places.get("location", "no place")))
+        raise ModelError(
+            f"{where} stores {name} in another file, {place}. Save the network as one "
+            "self-contained ONNX file."
+        )
+    kind = tensor.data_type
+    if kind not in VALUE_BYTES:
+        names = {number: text for text, number in TensorProto.DataType.items()}
+        raise ModelError(
+            f"{name} in {where} has the type {names.get(kind, kind)}, but weights must be plain "
+            "numbers. Convert them."
+        )
     if len(tensor.dims) > RANK or min(tensor.dims, default=0) < 0:
         raise ModelError(
-            f"{printable(repr(tensor.name))} in {where} has the size "
-            f"{printable(times(tensor.dims))}, but a tensor has at most {RANK} dimensions, each 0 "
-            "or more. Export it again."
+            f"{name} in {where} has the size {printable(times(tensor.dims))}, but a tensor has at "
+            f"most {RANK} dimensions, each 0 or more. Export it again."
         )
     # If a tensor states more values than it contains, a runtime allocates first and reads
     # afterwards.
     stated_count = math.prod(tensor.dims)
     raw = tensor.HasField("raw_data")
-    kind = tensor.data_type
     field = tensor.raw_data if raw else getattr(tensor, helper.tensor_dtype_to_field(kind))
     stored_count = len(field) / (VALUE_BYTES[kind] if raw else 1)
     if stated_count != stored_count:
         raise ModelError(
-            f"The weights {printable(repr(tensor.name))} in {where} state {times(tensor.dims)} "
-            f"values, but the file holds {stored_count:g}. Copy or export it again."
+            f"The weights {name} in {where} state {times(tensor.dims)} values, but the file holds "
+            f"{stored_count:g}. Copy or export it again."
         )
     if kind not in FLOATS:
         return
@@ -166,26 +178,8 @@ def _check_tensor(tensor: TensorProto, where: str) -> None:
     values = numpy_helper.to_array(tensor)
     missing = np.isnan(values) if not tensor.dims else ~np.isfinite(values)
     if missing.any():
-        name = printable(tensor.name) or "a constant"
+        short = printable(tensor.name) or "a constant"
         raise ModelError(
-            f"The weights of {where} must be finite, but {name} has {np.count_nonzero(missing)} "
+            f"The weights of {where} must be finite, but {short} has {np.count_nonzero(missing)} "
             "NaN or infinite values. Train or export the network again."
-        )
-
-
-def _check_place_and_type(tensor: TensorProto, where: str) -> None:
-    if tensor.data_location == TensorProto.EXTERNAL or tensor.external_data:
-        place = next(
-            (entry.value for entry in tensor.external_data if entry.key == "location"), "no place"
-        )
-        raise ModelError(
-            f"{where} stores {printable(repr(tensor.name))} in another file, "
-            f"{printable(repr(place))}. Save the network as one self-contained ONNX file."
-        )
-    if tensor.data_type not in VALUE_BYTES:
-        names = {number: name for name, number in TensorProto.DataType.items()}
-        kind = names.get(tensor.data_type, tensor.data_type)
-        raise ModelError(
-            f"{printable(repr(tensor.name))} in {where} has the type {kind}, but weights must be "
-            "plain numbers. Convert them."
         )
