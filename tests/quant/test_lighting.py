@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 import pytest
@@ -77,6 +78,14 @@ def test_default_patches_cover_the_range_and_those_of_the_gate_as_well() -> None
         sample_range = range_from(sum(map(histogram, patches.degraded), np.zeros(1)))
         assert sample_range.p99_9 > 0.75
         assert sample_range.p1 < 0.05
+
+
+def test_simulated_patches_are_shares_of_full_scale() -> None:
+    """The brightest unlit ground of a drawn scene, paint of 260 W/m2/sr/um, is below full scale."""
+    scenes = [procedural_scene(500, 520, np.random.default_rng(1))]
+    patches = draw_patches(scenes, SENSOR, REFERENCE, 8, 3, 40, lightings={})
+    largest = max(float(image.max()) for image in chain.from_iterable(patches.pairs))
+    assert 0.02 < largest <= 1
 
 
 def test_lightings_change_the_exposure_alone() -> None:

@@ -134,6 +134,7 @@ def test_a_network_that_is_not_tiled_is_predicted_by_the_frame() -> None:
     layers = result.layers
     work = math.fsum(row.figures["work"].value or 0 for row in layers if "work" in row.figures)
     assert frame.figures["work"].value == pytest.approx(work)
+    assert "frames of 32 x 32" in result.headings["frames"]
     assert any("whole images" in note and "GlobalAveragePool" in note for note in result.notes)
     assert not any("traditional" in name for name in names(result.rows))
     with pytest.raises(ModelError, match=r"GlobalAveragePool.*by the frame, leave out `size`\."):

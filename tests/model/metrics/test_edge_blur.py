@@ -4,8 +4,10 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from beers_deploy.model.metrics.edge_blur import THOROUGH, blurs_of, combine, plain_squares
+from beers_deploy.model.metrics.edge_blur import THOROUGH, AxisMtf, blurs_of, combine, plain_squares
 from beers_deploy.model.metrics.edge_fit import HALF_PX, STRICT, EdgeBlur, fit_blurs
+from beers_deploy.model.metrics.instrument import axis_mtfs
+from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.metrics.slanted_edge import slanted_edge
 from beers_deploy.model.simulator.mtf import Blur, gamma_from_mtf
 from beers_deploy.model.simulator.procedural import procedural_scene
@@ -67,6 +69,18 @@ def test_the_interval_of_a_few_edges_holds_the_truth(mtf_nyquist: float) -> None
         mtf_nyquist, rel=0.05
     )
     assert all(axis.interval[1] < 1.5 * axis.interval[0] for axis in estimates)
+
+
+@pytest.mark.parametrize(("count", "is_enough"), [(2, False), (3, True)])
+def test_three_edges_are_enough_for_an_axis(count: int, is_enough: bool) -> None:
+    rng = np.random.default_rng(3)
+    # So few pixels hold one square.
+    edge = clean(0.1, 5.0)[49:70, 49:70]
+    windows = [edge + SIGMA * rng.standard_normal(edge.shape) for _ in range(count)]
+    assert sum(len(find_blurs(window)) for window in windows) == count
+    measured = axis_mtfs(windows, noise, 4095)
+    assert isinstance(measured["across"], AxisMtf) is is_enough
+    assert isinstance(measured["along"], Refusal)
 
 
 def board(mtf_nyquist: Blur, lean_deg: float = 8.0, smear_px: float = 0.0) -> np.ndarray:

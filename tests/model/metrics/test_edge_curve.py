@@ -1,4 +1,5 @@
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,13 +16,19 @@ from beers_deploy.model.metrics.edge_curve import (
 from beers_deploy.model.metrics.edge_search import Edge, edge_in, find_edges
 from beers_deploy.model.metrics.mtf_basis import (
     CORNERS,
+    PARTS,
     at_distances,
     mtf_at,
     responses,
     weights_of,
 )
 from beers_deploy.model.metrics.refusal import Refusal
-from beers_deploy.model.metrics.uneven_edge import EdgePixels
+from beers_deploy.model.metrics.uneven_edge import (
+    NUMBERS,
+    EdgePixels,
+    FittedEdge,
+    normal_equations,
+)
 
 NOISE_DN = 4.0
 INDICES = [2, 5, 10]
@@ -146,3 +153,19 @@ def test_axes_are_separated_by_the_lean_of_their_edges(
 
     verdict = apart(mixed_curve(x, y, lean_x), mixed_curve(y, x, lean_y))
     assert verdict.contrast == pytest.approx(detector * np.exp(-x * FREQUENCIES), abs=1e-6)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_an_edge_of_a_curve_asks_for_that_curve(seed: int) -> None:
+    """An edge whose residuals are explained by its line and planes asks for no other curve."""
+    generator = np.random.default_rng(seed)
+    pixels: Any = None
+    line: Any = None
+    normal = generator.normal(size=(80, NUMBERS))
+    curve = generator.normal(size=(80, PARTS))
+    explained = normal @ generator.normal(size=NUMBERS)
+    edge = FittedEdge(pixels, line, 1.0, 0.0, normal, curve, explained, np.zeros(71, int))
+    weights = generator.random(PARTS)
+    for counts in (None, np.array([2.0])):
+        gram, moment = normal_equations(edge, weights, counts)
+        np.testing.assert_allclose(moment, gram @ weights, atol=1e-6)
