@@ -57,7 +57,7 @@ class DatasetRecipe:
         radiance_scale: a factor on the radiance of every scene.
         seed: the seed of drawn scenes, sensors and noise.
         tolerance_dn: the simulator leaves out effects that change no pixel by more, in DN.
-        scene_scale: a factor on the size of every scene.
+        scene_scale: a factor on the size of every scene, if the wanted ratio is not an integer.
     """
 
     scenes: tuple[Path | None, ...]  # None stands for a drawn scene.
@@ -68,7 +68,6 @@ class DatasetRecipe:
     radiance_scale: float = 1.0
     seed: int = 0
     tolerance_dn: float = TOLERANCE_DN
-    # The factor by which scenes are resampled first, if the wanted ratio is not an integer.
     scene_scale: float = 1.0
 
     def to_json(self) -> dict[str, object]:
@@ -132,7 +131,11 @@ def plan_windows(recipe: DatasetRecipe) -> list[Window]:
 def _scene_windows(recipe: DatasetRecipe, index: int, first: int) -> Iterator[Window]:
     path = recipe.scenes[index]
     ratio = recipe.oversampling
-    height, width = load(recipe, index).radiance.shape
+    sides: tuple[int, ...] = (DRAWN_SIDE_PX, DRAWN_SIDE_PX)
+    if path is not None:
+        # A scene that cannot be read is refused here. One is only drawn where its pixels are used.
+        sides = read_scene(path, recipe.reference.nominal()).radiance.shape
+    height, width = (round(side * recipe.scene_scale) for side in sides)
     stem = f"{index:04d}-{path.stem if path else 'drawn'}"
     if recipe.patch_px is None:
         if min(height, width) >= scene_side_px(1, ratio):
@@ -311,9 +314,7 @@ def _chunks(windows: list[Window]) -> Iterator[list[Window]]:
 
 
 def _remove_left_overs(out: Path) -> None:
-    """Delete the files that a run which was killed left half-written:
-    `whole_file` names them so.
-    """
+    """Delete the files that a killed run left half-written, by the names of `whole_file`."""
     for folder in (out, out / "parts", *(out / role for role in ROLES)):
         for path in folder.glob(".*.[0-9]*.part"):
             if not path.is_dir():
