@@ -30,12 +30,13 @@ _results: ContextVar[TextIO | None] = ContextVar("results", default=None)
 class Stream:
     """A wrapper of standard output or error in which a failed write does not end the run.
 
-    Text that cannot be written, for example because a pipe was closed, is dropped. A stream that
-    was already closed when the program started drops all text without counting it as lost.
+    Text that cannot be written, for example because the disk is full, is dropped. It does not count
+    as lost if nobody wants it: the reader of a pipe, such as `head`, has closed it, or the stream
+    was already closed when the program started.
 
     Attributes:
         stream: the wrapped stream.
-        lost: the reason why text was dropped; empty if none was.
+        lost: the reason why text was lost; empty if none was.
     """
 
     def __init__(self, stream: Any) -> None:
@@ -52,7 +53,8 @@ class Stream:
                 self.stream.write(text)
                 self.stream.flush()
             except OSError as error:
-                self.lost = error.strerror or str(error)
+                if not isinstance(error, BrokenPipeError):
+                    self.lost = error.strerror or str(error)
                 # Buffered text must not be tried once more when Python ends.
                 with suppress(OSError, ValueError):
                     os.dup2(os.open(os.devnull, os.O_WRONLY), self.stream.fileno())
