@@ -12,6 +12,7 @@ from beers_deploy.model.io.files import TIFF_SUFFIXES
 from beers_deploy.model.levels import Level
 from beers_deploy.model.raster.compression import Compression
 from beers_deploy.model.raster.facts import RESTORED_BY
+from beers_deploy.model.raster.reader import require_utf8
 from beers_deploy.model.raster.source import Source
 from beers_deploy.model.raster.writer import require_equal, write_cog, write_raster
 from beers_deploy.network import Network
@@ -56,9 +57,10 @@ class Output:
 
 
 def require_tiff_name(path: Path) -> None:
-    """Raise OptionError if the path of the restored image has no suffix of a TIFF, or if a sidecar
-    file (.msk or .aux.xml) exists already that readers would apply to the new image.
+    """Raise an error if the path of the restored image is not UTF-8 or has no suffix of a TIFF, or
+    if a sidecar file (.msk or .aux.xml) exists already that readers would apply to the new image.
     """
+    require_utf8(path)
     if path.suffix.lower() not in OUT_SUFFIXES:
         raise OptionError(
             f"The output must have the name of a TIFF, such as restored.tif, got {path.name}. "

@@ -75,8 +75,20 @@ OFFLINE = {"CPL_VSIL_CURL_ALLOWED_EXTENSIONS": "{none}"}
 logging.getLogger("rasterio").addHandler(logging.NullHandler())
 
 
+def require_utf8(path: Path) -> None:
+    """Raise ImageError if rasterio cannot open a path, because the name is not UTF-8."""
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError:
+        raise ImageError(
+            f"{printable(str(path.absolute()))} is not UTF-8, as names of images and of their "
+            "folders must be. Rename the part that is not."
+        ) from None
+
+
 def require_image_file(path: Path) -> None:
-    """Raise ImageError if a path is no file, or is an empty file."""
+    """Raise ImageError if a path is no file, is not UTF-8, or is an empty file."""
+    require_utf8(path)
     reason = unreadable(path)
     if reason is not None:
         raise ImageError(f"{printable(str(path))} cannot be read: {reason}. Check the path.")

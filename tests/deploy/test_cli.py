@@ -204,6 +204,15 @@ def test_a_reader_that_closes_its_pipe_changes_no_exit_code(
     assert (process.returncode, process.stderr) == (code, b"")
 
 
+def test_names_that_are_not_utf8_are_refused_before_any_work(tmp_path: Path) -> None:
+    """GDAL's Python module opens no other names, and would say so after the last row."""
+    image = acquisition(tmp_path / "in.tif")
+    latin = os.fsdecode(os.fsencode(tmp_path) + b"/\xe9.tif")
+    for words in ((image, latin), (latin, tmp_path / "out.tif")):
+        assert "not UTF-8" in refused("restore", *words)
+    assert list(tmp_path.iterdir()) == [image]
+
+
 @pytest.mark.parametrize("module", ["typing_extensions", "numpy"])
 def test_an_installation_that_does_not_work_is_no_failed_gate(module: str, tmp_path: Path) -> None:
     """If a library does not load, Python ends with 1, which is the code of a failed gate."""
