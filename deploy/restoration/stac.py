@@ -17,6 +17,7 @@ from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import rasterio
 from rasterio.warp import transform
@@ -149,8 +150,10 @@ def _write(item: Any, path: Path) -> None:
 
 
 def _href(file: Path, item: Path) -> str:
-    """Return the address of a file, relative to the folder of an item."""
-    return Path(os.path.relpath(file, item.parent)).as_posix()
+    """Return the address of a file, relative to the folder of an item, as the URI that STAC asks
+    for.
+    """
+    return quote(Path(os.path.relpath(file, item.parent)).as_posix(), errors="surrogateescape")
 
 
 def _corners(file: Any) -> list[tuple[float, float]]:

@@ -70,6 +70,19 @@ def test_an_item_is_valid_and_has_the_place_of_the_image(model: Path, tmp_path: 
     assert content["bbox"] == pytest.approx(list(expected), abs=1e-8)
 
 
+def test_addresses_are_uris(model: Path, tmp_path: Path) -> None:
+    image = images.write_tiff(tmp_path / "in.tif")
+    own = tmp_path / "50% é.onnx"
+    own.write_bytes(model.read_bytes())
+    item = tmp_path / "a #1.json"
+    done("restore", image, tmp_path / "a #1?.tif", "--network", own, "--cog", "--stac", item)
+    content = json.loads(item.read_text())
+    assert content["assets"]["restored"]["href"] == "a%20%231%3F.tif"
+    assert [link["href"] for link in content["links"]] == ["a%20%231-network.json"]
+    network = json.loads((tmp_path / "a #1-network.json").read_text())
+    assert network["assets"]["model"]["href"] == "50%25%20%C3%A9.onnx"
+
+
 def test_an_image_without_a_place_has_no_geometry(model: Path, tmp_path: Path) -> None:
     image = images.write_tiff(tmp_path / "in.tif", crs=None, transform=None)
     content = restored_item(image, tmp_path / "item.json", f"--network {model}")
