@@ -18,11 +18,12 @@ from beers_deploy.model.consistency.step import Consistency
 from beers_deploy.model.processor import require_cores
 from beers_deploy.network import Network, NetworkLike, other_precision
 from beers_deploy.performance.timing import cpu_load, interleaved, resident_bytes
-from beers_deploy.profiles.errors import counted
+from beers_deploy.profiles.errors import ModelError, counted
 from beers_deploy.profiles.figures import Figure, Row, measured
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.session import open_session, require_finite
+from beers_deploy.restoration.steps import keeps_pixels
 
 Samples = Sequence[tuple[float, Figure]]
 """The time in s and the mean power in W of each run."""
@@ -87,7 +88,8 @@ def host_rows(
 
     Returns:
         A row for each network with its median time (p50), 90th percentile, rate, power and memory;
-        the row of the step; and, with a counterpart, the ratio of float32 time to INT8 time.
+        the row of the step, for all bands, if it can follow the network; and, with a counterpart,
+        the ratio of float32 time to INT8 time.
     """
     require_cores("threads", threads)
     source = Network.load(network)
@@ -107,22 +109,9 @@ def host_rows(
     for name, samples, (_, held_bytes) in zip(networks, runs, opened, strict=True):
         figures = _figures(samples, held_bytes) | conditions
         rows.append(Row("host", f"{name}, {tile_px} x {tile_px}", figures))
-    if sensor is not None:
-        # The step runs on one thread, on a tile of noise.
-        instrument = sensor.nominal()
-        step = Consistency.of(instrument, sensor.reference.nominal())
-        generator = np.random.default_rng(0)
-        noise = generator.uniform(0, instrument.max_dn / 2, (tile_px, tile_px))
-        raw = noise.astype(np.float32)
-        side = Placed(tile_px, 0, 0, tile_px)
-        correct = partial(step.correction, raw, raw, side, side, (0, 0))
-        correct()
-        samples = interleaved([correct], min_runs, min_time_s)[0]
-        times_ms = np.array([1e3 * time_s for time_s, _ in samples])
-        how = f"{counted(len(times_ms), 'run')} on one thread after one for warm-up"
-        figures = {
-            f"p{p}": measured(float(np.percentile(times_ms, p)), "ms/tile", how) for p in (50, 90)
-        }
+    bands = _bands_of_step(source)
+    if sensor is not None and bands:
+        figures = _step_figures(sensor, tile_px, bands, (min_runs, min_time_s))
         rows.append(Row("host", f"consistency step, {tile_px} x {tile_px}", figures))
     if other is not None:
         own_s, other_s = (statistics.median(time_s for time_s, _ in run) for run in runs)
@@ -130,6 +119,46 @@ def host_rows(
         figure = measured(ratio, "x", f"medians of {len(runs[0])} runs each, interleaved")
         rows.append(Row("host", "float32 time / INT8 time, here", {"ratio": figure}))
     return rows
+
+
+def _bands_of_step(network: Network) -> int:
+    """Return the number of bands that the consistency step corrects after a network; 0 if it cannot
+    follow the network.
+    """
+    try:
+        tiling = network.geometry
+    except ModelError:
+        return 0
+    return tiling.channels_out if keeps_pixels(tiling) else 0
+
+
+def _step_figures(
+    sensor: Sensor, tile_px: int, bands: int, least: tuple[int, float]
+) -> dict[str, Figure]:
+    """Time the consistency step of all bands of a tile of noise, on one thread.
+
+    Args:
+        sensor: the sensor whose step is timed.
+        tile_px: the side of the tile in pixels.
+        bands: the number of bands.
+        least: the smallest number of runs, and their shortest total time in s.
+    """
+    instrument = sensor.nominal()
+    step = Consistency.of(instrument, sensor.reference.nominal())
+    generator = np.random.default_rng(0)
+    noise = generator.uniform(0, instrument.max_dn / 2, (tile_px, tile_px))
+    raw = noise.astype(np.float32)
+    side = Placed(tile_px, 0, 0, tile_px)
+
+    def correct() -> None:
+        for _ in range(bands):
+            step.correction(raw, raw, side, side, (0, 0))
+
+    correct()
+    samples = interleaved([correct], *least)[0]
+    times_ms = np.array([1e3 * time_s for time_s, _ in samples])
+    how = f"{counted(len(times_ms), 'run')} on one thread after one for warm-up"
+    return {f"p{p}": measured(float(np.percentile(times_ms, p)), "ms/tile", how) for p in (50, 90)}
 
 
 def conditions_of(threads: int) -> dict[str, Figure]:

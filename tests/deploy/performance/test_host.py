@@ -3,14 +3,17 @@
 from dataclasses import replace
 from pathlib import Path
 
+import onnx
 import pytest
 
+from beers_deploy.model.consistency.step import Consistency
 from beers_deploy.network import Network, other_precision
 from beers_deploy.performance.host import host_rows
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import TargetProfile
-from tests.deploy.dpu.graphs import float_convbeers
+from tests.deploy.dpu.graphs import SAME, float_convbeers, written
 from tests.shipped import shipped_pair
 
 SHORT = {"min_time_s": Constant(0.05, "stated", "test"), "min_runs": Constant(3, "stated", "test")}
@@ -61,3 +64,31 @@ def test_a_network_that_is_not_shipped_runs_alone(tmp_path: Path) -> None:
     assert [row.name for row in host_rows(path, QUICK, 32, 1) if row.table == "host"] == [
         "f, 32 x 32"
     ]
+
+
+STEP = "consistency step, 32 x 32"
+
+
+@pytest.mark.parametrize(
+    ("nodes", "bands"),
+    [
+        (f"y = {SAME}(image, w3x3x3x3)", 3),
+        (f"wide = {SAME}(image, w12x3x3x3) y = DepthToSpace<blocksize=2>(wide)", 0),
+        (f"y = {SAME}(image, w1x3x3x3)", 0),
+    ],
+)
+def test_the_step_is_timed_for_every_band_of_a_network_that_it_can_follow(
+    nodes: str, bands: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+    monkeypatch.setattr(Consistency, "correction", lambda *_: calls.append(1))
+    onnx.save_model(written(nodes, 3), tmp_path / "bands.onnx")
+    once = {
+        "min_time_s": Constant(1e-9, "stated", "test"),
+        "min_runs": Constant(2, "stated", "test"),
+    }
+    target = replace(QUICK, tables={"measurement": once})
+    rows = host_rows(tmp_path / "bands.onnx", target, 32, 1, Sensor.load("pleiades-degraded"))
+    assert (STEP in [row.name for row in rows]) == (bands > 0)
+    # One run is for warm-up.
+    assert len(calls) == bands * (1 + 2)
