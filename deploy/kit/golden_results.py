@@ -169,7 +169,14 @@ def where(differs: np.ndarray) -> str:
     reach_px = int(np.minimum(places, np.array([height - 1, width - 1]) - places).min(1).max()) + 1
     if reach_px < min(height, width) // 4:
         return f"within {reach_px} px of the border, in {within}"
-    for name, lines, size in (("rows", rows, height), ("columns", columns, width)):
+    for name, lines, size in (("row", rows, height), ("column", columns, width)):
         if len(lines) <= size // 4:
-            return f"in {name} {lines[0]} to {lines[-1]}, in {within}"
+            return f"in {_lines(name, lines)}, in {within}"
     return f"everywhere, in {within}"
+
+
+def _lines(name: str, lines: np.ndarray) -> str:
+    """Return the words for rows or columns, such as "row 9" or "rows 9 to 10"."""
+    if len(lines) == 1:
+        return f"{name} {lines[0]}"
+    return f"{name}s {lines[0]} to {lines[-1]}"

@@ -114,7 +114,7 @@ FAULTS: dict[str, tuple[Board, str, str]] = {
         (np.s_[:, :2], "everywhere, in 2 of 4 channels"),
         (np.s_[..., -3:, :], "within 3 px of the border, in 4 of 4 channels"),
         (np.s_[..., 9:11, :], "in rows 9 to 10, in 4 of 4 channels"),
-        (np.s_[..., 9], "in columns 9 to 9, in 4 of 4 channels"),
+        (np.s_[..., 9], "in column 9, in 4 of 4 channels"),
     ],
 )
 def test_the_place_of_differences_is_named(place: Any, words: str) -> None:
