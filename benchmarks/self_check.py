@@ -187,11 +187,14 @@ def flips(images: Path, name: str, count: int) -> str:
         costly += 1
         detected += bool((hurt.decidable & hurt.outside).any())
         costly_other_tiles += is_other_tile
+    line = f"{name}: {count} flips, of which {other_tiles} change the known tile"
+    if not costly:
+        return f"{line}; none costs a decidable block more than {COSTLY_DB:g} dB"
     hurt = flat(hurt_blocks)
     decidable = hurt.decidable
     by_loss = shares(hurt.outside[decidable], np.concatenate(losses_db)[decidable], LOSSES_DB)
     return (
-        f"{name}: {count} flips, of which {other_tiles} change the known tile; {costly} cost a "
+        f"{line}; {costly} cost a "
         f"decidable block more than {COSTLY_DB:g} dB, of which {costly_other_tiles} change the "
         f"known tile and {detected} are found without it; by the loss of decidable blocks in dB: "
         f"{by_loss}; by the sharpening of all blocks that lose as much: {by_class(hurt)}"
