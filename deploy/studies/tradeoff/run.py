@@ -392,4 +392,7 @@ def _notes(benchmark: Benchmark, boards: Sequence[str]) -> Iterator[str]:
         "Board latency counts each exposure that a tile of these images needs; 'bench' counts one, "
         "or those of its --image."
     )
-    yield "The pipelines know both sensors; next to each network stands what it knows of them."
+    yield (
+        "The pipelines know both sensors; the table of all points (-v) states what each network "
+        "knows of them."
+    )
