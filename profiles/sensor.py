@@ -6,6 +6,7 @@ it.
 
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -99,7 +100,8 @@ class Sensor:
     snr_1: Ratio | None = None
     alpha: Variance | None = None
     beta: Variance | None = None
-    effects: Effects = Field(default_factory=dict)
+    # A dictionary has no hash. Sensors that differ in effects alone share theirs.
+    effects: Effects = field(default_factory=dict, hash=False)
     mtf_nyquist_along: Contrast | None = None
     response: Response | None = None
 

@@ -6,10 +6,11 @@ shipped board. So a board with a known DPU only needs to state its cores, clock 
 
 import os
 from collections.abc import Mapping
+from dataclasses import field
 from functools import cache
 from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, model_validator
 from pydantic.dataclasses import dataclass
 
 from beers_deploy.profiles.constant import Constant, Words
@@ -70,14 +71,15 @@ class TargetProfile:
 
     name: str
     description: str
-    tables: dict[str, dict[str, Constant]]
+    # Dictionaries have no hash: that of a board is of its name and description.
+    tables: dict[str, dict[str, Constant]] = field(hash=False)
     default_configuration: str | None = None
-    configurations: dict[str, dict[str, Constant]] = Field(default_factory=dict)
-    activations: dict[str, Annotated[Words, AfterValidator(_activations)]] = Field(
-        default_factory=dict
+    configurations: dict[str, dict[str, Constant]] = field(default_factory=dict, hash=False)
+    activations: dict[str, Annotated[Words, AfterValidator(_activations)]] = field(
+        default_factory=dict, hash=False
     )
-    documents: dict[str, str] = Field(default_factory=dict)
-    npu: dict[str, Words] = Field(default_factory=dict)
+    documents: dict[str, str] = field(default_factory=dict, hash=False)
+    npu: dict[str, Words] = field(default_factory=dict, hash=False)
 
     @model_validator(mode="after")
     def _is_possible(self) -> Self:

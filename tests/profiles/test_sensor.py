@@ -209,3 +209,10 @@ def test_a_number_of_numpy_replaces_one_of_a_sensor(kind: type) -> None:
     sensor = Sensor.load("pleiades-degraded").replace(snr_1=kind(100), snr_0=(kind(40), kind(45)))
     assert sensor.snr_pair[1].value == 100
     assert sensor.snr_pair[0].value == (40, 45)
+
+
+@pytest.mark.parametrize("kind", [Sensor, TargetProfile])
+def test_equal_profiles_have_one_hash(kind: type[Sensor] | type[TargetProfile]) -> None:
+    """A profile is a value, which users put into sets and take as keys."""
+    names = sensor_names() if kind is Sensor else target_names()
+    assert len({kind.load(name) for name in names * 2}) == len(names)
