@@ -28,7 +28,7 @@ from beers_deploy.model.self_check import (
     SelfCheck,
 )
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.figures import Figure, measured
+from beers_deploy.profiles.figures import Figure, measured, unavailable
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.restoration.bands import by_band
@@ -82,17 +82,20 @@ class BlockMap:
     @property
     def figures(self) -> dict[str, Figure]:
         """Two figures in %, by name, for the results of a run: the share of decidable blocks that
-        contradict the raw image, and the share of blocks too smooth to decide.
+        contradict the raw image, and the share of blocks too smooth to decide. A share of no block
+        is unavailable.
         """
         blocks = f"blocks of {BLOCK_PX} x {BLOCK_PX} pixels"
         outside = f"{blocks} that are decidable: differ from the raw image by more than noise"
         smooth = f"{blocks}: too smooth to show a wrong restoration"
         undecided = self.known - self.decidable
         return {
-            "self-check outside": measured(
-                100 * self.outside / max(self.decidable, 1), "%", outside
+            "self-check outside": _share(
+                self.outside, self.decidable, outside, "no block would show a wrong restoration"
             ),
-            "self-check not decidable": measured(100 * undecided / max(self.known, 1), "%", smooth),
+            "self-check not decidable": _share(
+                undecided, self.known, smooth, "no block has enough pixels to be compared"
+            ),
         }
 
     @property
@@ -118,6 +121,13 @@ class BlockMap:
         """
         if self.doubt:
             raise ImageError(f"{name}: the restoration {self.doubt}")
+
+
+def _share(part: int, whole: int, source: str, none: str) -> Figure:
+    """Return a share of blocks in %; unavailable for the reason `none` if there is no block."""
+    if not whole:
+        return unavailable("%", none)
+    return measured(100 * part / whole, "%", source)
 
 
 def checks_of(

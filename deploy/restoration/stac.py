@@ -78,7 +78,11 @@ def write_item(run: Run, path: Path, maps: Mapping[str, Path]) -> None:
     pystac: Any = import_module("pystac")
     now = datetime.now(UTC)
     (row,) = run.rows
-    figures = {name: f"{figure} {figure.unit}" for name, figure in row.figures.items()}
+    figures = {
+        name: f"{figure} {figure.unit}"
+        for name, figure in row.figures.items()
+        if figure.value is not None
+    }
     facts = {**row.text, **figures}
     steps = [f"{name}: {facts[name]}" for name in LINEAGE if name in facts]
     # The runtime is stated with its version; the traditional pipeline has none.

@@ -8,16 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 import rasterio
+import tifffile
 from numpy.testing import assert_array_equal
 
 import beers_deploy as bd
-from beers_deploy.model.self_check import BLOCK_PX, MOST_CHI2
+from beers_deploy.model.self_check import BLOCK_PX, MOST_CHI2, Judged
 from beers_deploy.profiles.errors import ImageError, MachineError, OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration import run as run_module
+from beers_deploy.restoration.self_check import BlockMap
 from beers_deploy.verbs.restore import restore
-from tests.deploy.restoration.runs import NAME, TRANSFORM, names
+from tests.deploy.restoration.runs import NAME, TRANSFORM, names, noise
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +69,17 @@ def test_a_right_restoration_is_within_the_bound_and_its_map_is_georeferenced(
         np.concatenate([state[known], state_red[np.isfinite(state_red)]]) == 2
     )
     assert row.figures["self-check not decidable"].value == pytest.approx(undecided)
+
+
+def test_an_image_without_a_block_to_compare_has_no_share_of_blocks(tmp_path: Path) -> None:
+    """A share of no block is not 0 %, which would mean that the image was checked."""
+    tifffile.imwrite(tmp_path / "in.tif", noise(40, 70))
+    row = run(tmp_path / "in.tif", tmp_path / "out.tif", network="convbeers-xs")
+    for name in ("self-check outside", "self-check not decidable"):
+        assert row.figures[name].value is None
+    assert BlockMap({0: Judged(np.ones((1, 1)), np.zeros((1, 1)))}).figures[
+        "self-check not decidable"
+    ].value == pytest.approx(100)
 
 
 def test_a_network_for_another_sensor_is_reported(
