@@ -21,7 +21,7 @@ from beers_deploy.model.raster.facts import (
     usable_nodata,
 )
 from beers_deploy.model.raster.source import ArraySource
-from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.errors import ImageError, OptionError, reason_of
 from beers_deploy.restoration.interval import HalfWidths, half_widths_of
 from beers_deploy.restoration.prepare import NetworkPipeline, Pipeline
 from beers_deploy.restoration.radiometry import Reading
@@ -57,9 +57,9 @@ def restore_array(
     # Arrays of xarray and torch are recognised by their attributes, so that neither is imported.
     if hasattr(image, "coords") and hasattr(image, "dims"):
         results = _restore_labelled(image, reading, load, level)
-    elif hasattr(image, "detach"):
+    elif hasattr(image, "detach") and hasattr(image, "device"):
         torch = import_module("torch")
-        arrays = _restore(image.detach().cpu().numpy(), reading, load, level)
+        arrays = _restore(_numpy_of(image), reading, load, level)
         results = [torch.from_numpy(pixels).to(image.device) for pixels in arrays]
     else:
         results = _restore(image, reading, load, level)
@@ -76,11 +76,22 @@ def restore_array(
     return results[0] if level is None else tuple(results)
 
 
+def _numpy_of(tensor: Any) -> np.ndarray:
+    """Return the values of a tensor of torch; raise ImageError if NumPy has no such array."""
+    try:
+        return np.asarray(tensor.detach().cpu().numpy())
+    except (RuntimeError, TypeError) as error:
+        raise ImageError(
+            f"`image` is a tensor that NumPy does not read: {reason_of(error)}. Convert it, for "
+            "example with .float() or .to_dense()."
+        ) from error
+
+
 def _restore_labelled(
     image: Any, reading: Reading, load: Callable[[], Pipeline], level: Level | None
 ) -> list[Any]:
-    """Restore an xarray.DataArray. The bands may follow the rows and columns if the name of their
-    dimension identifies them.
+    """Restore an xarray.DataArray, whose dimensions may have any order if their names identify
+    them.
     """
     if hasattr(image, "data_vars"):
         names = ", ".join(map(str, image.data_vars)) or "none"
@@ -93,9 +104,8 @@ def _restore_labelled(
     full_scale = own.get("full_scale") if reading.full_scale is None else reading.full_scale
     nodata = own.get("_FillValue") if reading.nodata is None else reading.nodata
     dims = image.dims
-    bands = next((dim for dim in image.dims if dim in BAND_DIMS), None)
-    ordered = image if bands is None or image.ndim != 3 else image.transpose(bands, ...)
-    if image.ndim == 3 and bands is None and ordered.shape[-1] <= FEW < min(ordered.shape[:-1]):
+    ordered = image.transpose(*sorted(dims, key=lambda dim: PLACES.get(dim, UNKNOWN)))
+    if image.ndim == 3 and ordered.shape[-1] <= FEW < min(ordered.shape[:-1]):
         raise _bands_last(ordered.shape, "Name the dimension of the bands 'band'")
     reading = replace(reading, full_scale=full_scale, nodata=nodata)
     labelled = [
@@ -172,7 +182,16 @@ def _labelled(image: Any, pixels: Any) -> Any:
     return type(image)(pixels, coordinates, dims, image.name, image.attrs)
 
 
-BAND_DIMS = ("band", "bands", "channel", "wavelength")
+UNKNOWN = 1
+"""The place of a dimension of another name than in PLACES. Next to rows and columns it has the
+bands, for example points of time; next to bands, unknown dimensions keep their order.
+"""
+PLACES = {
+    **dict.fromkeys(("band", "bands", "channel", "wavelength"), 0),
+    **dict.fromkeys(("y", "lat", "latitude"), 2),
+    **dict.fromkeys(("x", "lon", "longitude"), 3),
+}
+"""The places of an image's dimensions by their names in xarray."""
 FEW = 4
 """The largest number of bands of a photograph. A last axis of at most this length after two longer
 ones holds bands, not columns.
@@ -191,6 +210,9 @@ def _bands_first(image: Any) -> Any:
         )
     if len(shape) == 3 and shape[2] <= FEW < min(shape[:2]):
         raise _bands_last(shape, "Put them first with numpy.moveaxis(image, -1, 0)")
+    if not isinstance(image, np.ndarray) and not hasattr(image, "__dask_graph__"):
+        # Arrays of HDF5, Zarr or pandas are not indexed as those of NumPy.
+        image = np.asarray(image)
     return image if len(shape) == 3 else image[None]
 
 

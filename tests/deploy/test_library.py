@@ -1,5 +1,6 @@
 """Test that arrays of NumPy, Dask and xarray are restored to the same pixels, or refused."""
 
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +114,38 @@ def test_a_data_array_keeps_its_labels(lazy: bool, da: Any, model: Path) -> None
     assert (restored.attrs, restored.name, restored.dims) == (image.attrs, image.name, image.dims)
     other = restore(image, network=model, tile=23, nodata=4000)
     assert (other.values != restored.values).any()
+
+
+@pytest.mark.parametrize(
+    "dims", [("x", "y", "band"), ("y", "time", "x"), ("lon", "lat", "t"), ("band", "row", "column")]
+)
+def test_the_order_of_named_dimensions_changes_no_pixel(dims: tuple[str, ...], model: Path) -> None:
+    """A network and a sensor treat rows and columns differently, in whatever order they lie."""
+    xarray = pytest.importorskip("xarray")
+    pixels = noise(2, 40, 30)
+    sizes = {"y": 1, "lat": 1, "row": 1, "x": 2, "lon": 2, "column": 2}
+    axes = [sizes.get(dim, 0) for dim in dims]
+    image = xarray.DataArray(pixels.transpose(axes), dims=dims)
+    restored = restore(image, network=model, tile=23)
+    assert restored.dims == dims
+    assert_array_equal(restored.values, restore(pixels, network=model, tile=23).transpose(axes))
+
+
+def test_arrays_of_other_libraries_are_read_as_numpy_s(model: Path) -> None:
+    pandas = pytest.importorskip("pandas")
+    pixels = noise(40, 30)
+    frame = restore(pandas.DataFrame(pixels), network=model, tile=23)
+    assert_array_equal(frame, restore(pixels, network=model, tile=23))
+
+
+def test_what_numpy_does_not_read_is_refused(model: Path) -> None:
+    torch = pytest.importorskip("torch")
+    tensor = torch.full((40, 30), 800.0)
+    for image in (tensor.bfloat16(), tensor.to_sparse(), tensor.to("meta")):
+        with pytest.raises(ImageError, match="NumPy does not read"):
+            restore(image, network=model)
+    with pytest.raises(ImageError, match="BytesIO"):
+        restore(BytesIO(b"II*"), network=model)
 
 
 def test_a_data_array_of_more_pixels_has_their_places(tmp_path: Path) -> None:
