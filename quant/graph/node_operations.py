@@ -9,6 +9,7 @@ import numpy as np
 
 from beers_deploy.quant.graph.operations import (
     LEAKY_SLOPE,
+    PLANES,
     Activation,
     AveragePool,
     Concat,
@@ -27,6 +28,10 @@ from beers_deploy.quant.onnx.window import Pair, Window
 PAD_STRIDES = (
     "Pad strided convolutions and pools, so that their result has a half or a quarter of the size, "
     "enlarge it by 2 or 4, and train again; attention such as RFDN's can also be left out."
+)
+OF_ONE_SENSOR = (
+    "'export' wrote this file for one sensor, from weights whose filter bank 'quantize' computes "
+    "itself. Quantise the shipped name or the .safetensors file instead."
 )
 SHRINK = "Shrink by a pool or a strided convolution, or cut the network in front of it."
 
@@ -229,7 +234,9 @@ def read_activation(graph: OnnxGraph, node: Node) -> Activation:
     if node.op_type == "Clip":
         low, high = (graph.value(node, k) for k in (1, 2))
         six = low is not None and high is not None and float(low) == 0 and float(high) == 6
-        require(six, node, "must clip from 0 to 6 (ReLU6)")
+        # The name is that of our own export, whose bank clips to 12 bits.
+        remedy = OF_ONE_SENSOR if node.result == PLANES else REMEDY
+        require(six, node, "must clip from 0 to 6 (ReLU6)", remedy)
     if node.op_type == "HardSigmoid":
         alpha = node.attributes.get("alpha", 0.2)
         beta = node.attributes.get("beta", 0.5)

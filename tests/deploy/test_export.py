@@ -80,6 +80,13 @@ def test_a_network_behind_a_bank_is_exported_for_one_sensor(
     assert tiling.halo_px == radius_px(banked.variant) + (3 if scale == 1 else 4)
 
 
+def test_quantize_names_the_weights_of_an_export_for_one_sensor(tmp_path: Path) -> None:
+    done(f"export --network convbeers-xs --out {tmp_path}/float.onnx")
+    message = refused(f"quantize {tmp_path}/float.onnx --out {tmp_path}/int8.onnx")
+    assert "'export' wrote this file for one sensor" in message
+    assert "Quantise the shipped name" in message
+
+
 def test_a_network_that_gives_nan_is_not_exported(network: ConvBEERS, tmp_path: Path) -> None:
     weights = tmp_path / "run.safetensors"
     out = tmp_path / "float.onnx"
