@@ -28,6 +28,8 @@ from beers_deploy.quant.onnx_file import GraphWriter, load_onnx, make_model, rea
 from beers_deploy.quant.untrusted import times
 
 if TYPE_CHECKING:
+    import torch
+
     from beers_deploy.model.convbeers import ConvBEERS
 
 
@@ -239,12 +241,12 @@ def about(variant: str, weights: Weights, sensor: str | None = None) -> dict[str
     }
 
 
-def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
+def exported(module: Any, example: "Sequence[int] | torch.Tensor") -> onnx.ModelProto:
     """Export a torch module to ONNX, for any number and size of images.
 
     Args:
         module: the torch.nn.Module. Its training mode is restored afterwards.
-        example: shape (N, C, H, W) of an input that the module accepts.
+        example: an input (N, C, H, W) that the module accepts, or its shape.
 
     Returns:
         The ONNX model, with the input `image` and the output `restored`.
@@ -262,12 +264,16 @@ def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
     free = {name: {0: "N", 2: "H", 3: "W"} for name in ("image", "restored")}
     stream = io.BytesIO()
     training = module.training
+    # torch.onnx.export itself accepts the input.
+    shape = getattr(example, "shape", ())
+    sizes = shape if len(shape) == 4 else example
     with warnings.catch_warnings():
         # The exporter's own warnings do not count, because its file is checked below.
         warnings.simplefilter("ignore")
         try:
             names = {"input_names": ["image"], "output_names": ["restored"], "dynamic_axes": free}
-            image = torch.zeros(tuple(example))
+            # A notebook may have another default type.
+            image = torch.zeros(tuple(sizes), dtype=torch.float32)
             torch.onnx.export(
                 module.eval(), (image,), stream, opset_version=OPSET, dynamo=False, **names
             )
@@ -276,7 +282,7 @@ def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
             reason = reason_of(error)
             raise ModelError(
                 f"torch cannot export the module {type(module).__name__}: {reason}. Check that it "
-                f"accepts an image of {times(example)}, or load it first with "
+                f"accepts an image of {times(sizes)}, or load it first with "
                 "Network.load(module, example=(N, C, H, W))."
             ) from error
         finally:

@@ -103,7 +103,7 @@ class Network:
         *,
         sensor: SensorLike = BLIND,
         int8: bool | None = None,
-        example: Sequence[int] = (1, 1, 64, 64),
+        example: "Sequence[int] | torch.Tensor" = (1, 1, 64, 64),
         to_run: bool = True,
     ) -> "Network":
         """Load a network from an ONNX or safetensors file, a shipped name, a ModelProto or a torch
@@ -117,7 +117,7 @@ class Network:
                 their filters are computed from it. By default the sensor is unknown.
             int8: True for INT8 and False for float32 in a network that `sensor` conditions; None
                 to decide by the suffix -int8 of its name. Other networks ignore it.
-            example: shape (N, C, H, W) of an input that a torch module accepts. The exported
+            example: an input (N, C, H, W) that a torch module accepts, or its shape. The exported
                 network accepts any N, H and W.
             to_run: True if onnxruntime will run the network; False to inspect only the nodes of an
                 .onnx file, which may then be operators that onnxruntime does not know.

@@ -1,12 +1,14 @@
-"""Read NumPy files from untrusted sources, without unpickling.
+"""Read NumPy files from untrusted sources, without unpickling, and tensors of torch.
 
-Any damage is reported as one reason.
+Any damage of a file is reported as one reason.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from beers_deploy.profiles.errors import ImageError, reason_of
 from beers_deploy.profiles.toml import unreadable
 
 ZIP = b"PK"
@@ -52,3 +54,22 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
     except Exception as error:
         # NumPy's own message advises to load any other file unsafely.
         raise ValueError("it has another format, or is damaged") from error
+
+
+def array_of(tensor: Any, name: str) -> np.ndarray:
+    """Return the values of a tensor of torch, on any device, with or without a gradient.
+
+    Args:
+        tensor: the tensor.
+        name: the name of the parameter, for the message.
+
+    Raises:
+        ImageError: NumPy has no such array, for example of bfloat16 or of a sparse tensor.
+    """
+    try:
+        return np.asarray(tensor.detach().cpu().numpy())
+    except (RuntimeError, TypeError) as error:
+        raise ImageError(
+            f"`{name}` has a tensor that NumPy does not read: {reason_of(error)}. Convert it, for "
+            "example with .float() or .to_dense()."
+        ) from error

@@ -21,7 +21,8 @@ from beers_deploy.model.raster.facts import (
     usable_nodata,
 )
 from beers_deploy.model.raster.source import ArraySource
-from beers_deploy.profiles.errors import ImageError, OptionError, reason_of
+from beers_deploy.profiles.arrays import array_of
+from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.restoration.interval import HalfWidths, half_widths_of
 from beers_deploy.restoration.prepare import NetworkPipeline, Pipeline
 from beers_deploy.restoration.radiometry import Reading
@@ -59,7 +60,7 @@ def restore_array(
         results = _restore_labelled(image, reading, load, level)
     elif hasattr(image, "detach") and hasattr(image, "device"):
         torch = import_module("torch")
-        arrays = _restore(_numpy_of(image), reading, load, level)
+        arrays = _restore(array_of(image, "image"), reading, load, level)
         results = [torch.from_numpy(pixels).to(image.device) for pixels in arrays]
     else:
         results = _restore(image, reading, load, level)
@@ -74,17 +75,6 @@ def restore_array(
                 mask = np.broadcast_to(planes, results[0].shape)
             results = [np.ma.array(pixels, mask=mask) for pixels in results]
     return results[0] if level is None else tuple(results)
-
-
-def _numpy_of(tensor: Any) -> np.ndarray:
-    """Return the values of a tensor of torch; raise ImageError if NumPy has no such array."""
-    try:
-        return np.asarray(tensor.detach().cpu().numpy())
-    except (RuntimeError, TypeError) as error:
-        raise ImageError(
-            f"`image` is a tensor that NumPy does not read: {reason_of(error)}. Convert it, for "
-            "example with .float() or .to_dense()."
-        ) from error
 
 
 def _restore_labelled(

@@ -8,7 +8,7 @@ import numpy as np
 
 from beers_deploy.model.io.files import IMAGE_SUFFIXES
 from beers_deploy.model.raster.images import read_pixels
-from beers_deploy.profiles.arrays import load_arrays
+from beers_deploy.profiles.arrays import array_of, load_arrays
 from beers_deploy.profiles.errors import ImageError, printable
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.input_range import Ranges, from_shares
@@ -78,8 +78,7 @@ def _batch(array: Any) -> np.ndarray:
 
 
 def _plain(array: Any) -> np.ndarray:
-    # NumPy refuses a tensor of torch that still has a gradient.
-    return np.asarray(array.detach() if hasattr(array, "detach") else array)
+    return array_of(array, IN_MEMORY) if hasattr(array, "detach") else np.asarray(array)
 
 
 def sample_files(path: Path) -> list[Path]:

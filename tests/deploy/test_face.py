@@ -98,6 +98,17 @@ def test_a_module_computes_as_in_torch(tiny: bd.Network) -> None:
     assert (tiny.precision, tiny.tiling.halo_px) == ("float32", 2)
 
 
+def test_a_module_is_exported_with_an_input_of_it_in_any_default_type(tiny: bd.Network) -> None:
+    """torch.onnx.export accepts the input as well, and a notebook may compute in float64."""
+    module = Tiny()
+    torch.set_default_dtype(torch.float64)
+    try:
+        loaded = bd.Network.load(module, example=torch.rand(1, 1, 8, 8))
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert_array_equal(loaded(np.ones((1, 1, 9, 9))), tiny(np.ones((1, 1, 9, 9))))
+
+
 def test_a_network_is_loaded_from_a_path_a_model_or_a_network(
     tiny: bd.Network, tmp_path: Path
 ) -> None:

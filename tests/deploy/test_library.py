@@ -142,7 +142,7 @@ def test_what_numpy_does_not_read_is_refused(model: Path) -> None:
     torch = pytest.importorskip("torch")
     tensor = torch.full((40, 30), 800.0)
     for image in (tensor.bfloat16(), tensor.to_sparse(), tensor.to("meta")):
-        with pytest.raises(ImageError, match="NumPy does not read"):
+        with pytest.raises(ImageError, match="`image` has a tensor that NumPy does not read"):
             restore(image, network=model)
     with pytest.raises(ImageError, match="BytesIO"):
         restore(BytesIO(b"II*"), network=model)

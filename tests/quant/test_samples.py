@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.quant.samples.own import OwnSamples, read_samples, samples_of
 from beers_deploy.quant.samples.patches import Regenerated
+from beers_deploy.quant.samples.stored import samples_in
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from tests.quant.quick import fix_sizes
 from tests.quant.simplify.networks import parsed
@@ -86,6 +87,12 @@ def test_every_fourth_sample_is_held_out_from_calibration(tmp_path: Path) -> Non
     assert samples.drawn.digest != samples.unseen.digest
     few = OwnSamples("few", samples.samples[:3])
     assert few.drawn.digest == few.unseen.digest == few.all.digest
+
+
+def test_a_tensor_that_numpy_does_not_read_is_refused() -> None:
+    torch = pytest.importorskip("torch")
+    with pytest.raises(ImageError, match=r"`samples` has a tensor .*BFloat16"):
+        samples_in(torch.from_numpy(ONE_CHANNEL).bfloat16())
 
 
 def test_samples_without_contrast_are_left_out() -> None:
