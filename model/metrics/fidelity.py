@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.errors import ImageError, optional
 from beers_deploy.profiles.instrument import MAX_DN
 
 SSIM_SIGMA_PX = 1.5
@@ -50,7 +50,7 @@ def ssim(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
         ImageError: the image is smaller than the window.
     """
     # Imported here, because PSNR alone needs none of its half second.
-    from skimage.metrics import structural_similarity
+    metrics = optional("skimage.metrics", "ssim")
 
     if min(image.shape) < MIN_SIDE_PX:
         raise ImageError(
@@ -61,7 +61,7 @@ def ssim(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
     pair = (np.asarray(each, np.float64) for each in (image, reference))
     window = {"gaussian_weights": True, "sigma": SSIM_SIGMA_PX, "use_sample_covariance": False}
     with np.errstate(invalid="ignore"):
-        return float(structural_similarity(*pair, data_range=data_range, **window))
+        return float(metrics.structural_similarity(*pair, data_range=data_range, **window))
 
 
 def fidelity_db(

@@ -379,12 +379,14 @@ assert bd.gate(int8, samples=samples, limits={"mae": 0.01}) and bd.check(int8)
 assert any("needs the package torch" in note for note in bd.bench(int8).notes)
 assert bd.restore(image, network="convbeers-xs-int8").shape == (40, 50)
 assert bd.restore(image, network="convbeers-xs", sensor="pleiades-degraded").shape == (40, 50)
-assert bd.simulate(size=48).degraded.shape == (48, 48)
+pair = bd.simulate(size=48)
+assert pair.degraded.shape == (48, 48)
 for call, extra in (
     (lambda: bd.quantize("tiny.onnx", samples=samples, finetune=1, progress=False), "torch"),
     (lambda: bd.evaluate(methods="degraded"), "torch"),
     (lambda: bd.restore(image, method="traditional", sensor="pleiades-degraded"), "torch"),
     (lambda: bd.sensors().plot(), "study"),
+    (lambda: pair.ssim(pair.degraded), "study"),
     (lambda: bd.sensors().to_pandas(), "notebook"),
 ):
     try:
