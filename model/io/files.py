@@ -7,6 +7,7 @@ would replace them.
 
 import hashlib
 import os
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import chain, combinations
@@ -20,6 +21,12 @@ IMAGE_SUFFIXES = TIFF_SUFFIXES | {".png", ".jpg", ".jpeg"}
 READ_SUFFIXES = IMAGE_SUFFIXES | {".onnx", ".safetensors", ".pth"}
 """The suffixes of files that a command reads from a folder. Results of an earlier run may lie in
 the same folder and be overwritten.
+"""
+
+URL = re.compile(r"[a-z][a-z0-9+.-]+:/|/vsi", re.IGNORECASE)
+"""The beginning of a URL, of which a path retains one slash, or of a virtual path of GDAL.
+
+A URL would become folders of these names, and rasterio would take either for a place on a network.
 """
 
 
@@ -104,7 +111,14 @@ def _require_apart(
 
 
 def require_regular(path: Path) -> None:
-    """Raise MachineError if an output is an existing folder, link, pipe or device."""
+    """Raise MachineError if an output is an existing folder, link, pipe or device, or no file of
+    this machine.
+    """
+    if URL.match(path.as_posix()):
+        raise MachineError(
+            f"{printable(str(path))} is not on this machine, where an output must be. Write a "
+            "file, and copy it there."
+        )
     if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
         kind = "is not a regular file"
         if path.is_symlink():

@@ -183,6 +183,17 @@ def test_only_a_regular_file_is_written_over(
     refused(command_with(name, tmp_path, **{option: value}), tmp_path, str(file), word)
 
 
+@pytest.mark.parametrize("url", ["s3://bucket/out.tif", "HTTP://host/out.tif", "/vsis3/out.tif"])
+def test_no_output_is_a_url(url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its folders would be made here, and rasterio would refuse it after the last row."""
+    monkeypatch.chdir(tmp_path)
+    image = existing(tmp_path / "in.tif")
+    before = state(tmp_path)
+    for words in (("restore", image, url), ("check", "--json", url)):
+        assert "not on this machine" in done(*words, code=2)
+    assert state(tmp_path) == before
+
+
 @pytest.mark.parametrize(("name", "option"), [pair for pair in WRITERS if pair[1] != JSON])
 def test_standard_output_is_for_results_alone(name: str, option: str, tmp_path: Path) -> None:
     command = command_with(name, tmp_path, **{option: Path("-")})
