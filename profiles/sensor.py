@@ -17,7 +17,13 @@ from pydantic.dataclasses import dataclass
 
 from beers_deploy.profiles.constant import Constant, Limits, Stated
 from beers_deploy.profiles.effects import Effect, Effects, settled
-from beers_deploy.profiles.errors import ProfileError, as_path, counted, require_numbers
+from beers_deploy.profiles.errors import (
+    MachineError,
+    ProfileError,
+    as_path,
+    counted,
+    require_numbers,
+)
 from beers_deploy.profiles.instrument import (
     OFFSET,
     Instrument,
@@ -142,8 +148,21 @@ class Sensor:
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the profile as a TOML file that `load` reads, with a point-spread function next to
         it as .npy.
+
+        Raises:
+            MachineError: the file cannot be written.
         """
         path = as_path(path)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._write(path)
+        except OSError as error:
+            raise MachineError(
+                f"{path} cannot be written: {error.strerror}. Choose another path."
+            ) from error
+        return path
+
+    def _write(self, path: Path) -> None:
         tables: dict[str, dict[str, object]] = {table: {} for table in TABLES}
         for key, table in TABLE_OF.items():
             if constant := getattr(self, key):
@@ -165,7 +184,6 @@ class Sensor:
             }
         text = sensor_toml(self.description, {**tables, **self.effects})
         path.write_text(text, encoding="utf-8")
-        return path
 
     @property
     def contrasts(self) -> tuple[Constant, Constant]:

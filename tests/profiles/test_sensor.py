@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.profiles.effects import Smear
-from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.errors import MachineError, ProfileError
 from beers_deploy.profiles.instrument import noise_from_snr, snr_0_bounds
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import TABLES
@@ -216,3 +216,10 @@ def test_equal_profiles_have_one_hash(kind: type[Sensor] | type[TargetProfile]) 
     """A profile is a value, which users put into sets and take as keys."""
     names = sensor_names() if kind is Sensor else target_names()
     assert len({kind.load(name) for name in names * 2}) == len(names)
+
+
+def test_a_sensor_is_saved_into_a_new_folder_or_refused_in_a_sentence(tmp_path: Path) -> None:
+    sensor = Sensor.load("pleiades-degraded")
+    assert Sensor.load(sensor.save(tmp_path / "new" / f"{sensor.name}.toml")) == sensor
+    with pytest.raises(MachineError, match="cannot be written"):
+        sensor.save(tmp_path)
