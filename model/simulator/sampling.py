@@ -86,9 +86,9 @@ def resample(radiance: np.ndarray, height: int, width: int) -> np.ndarray:
     """Resample a scene (H, W) onto another grid over the same ground, band-limited, for non-integer
     ratios.
 
-    Frequencies beyond the new grid are cut, and the others are unchanged. Frequencies that only the
-    new grid has are zero. Pixel n of the new grid lies at (n + 1/2) H / height - 1/2 of the old, so
-    that the ground does not shift. The borders wrap.
+    Frequencies below the Nyquist frequency of both grids are unchanged, and all others are zero: at
+    Nyquist itself, a grid holds waves of one phase alone. Pixel n of the new grid lies at (n + 1/2)
+    H / height - 1/2 of the old, so that the ground does not shift. The borders wrap.
 
     scikit-image's `resize` is not used, because its splines blur and alias, on a photograph by 26
     of 255 and more (measured).
@@ -100,8 +100,8 @@ def resample(radiance: np.ndarray, height: int, width: int) -> np.ndarray:
     rows = min(old_height, height)
     columns = min(old_width, width)
     top = (rows + 1) // 2
-    bottom = rows // 2
-    half = columns // 2 + 1
+    bottom = (rows - 1) // 2
+    half = (columns + 1) // 2
     resampled = np.zeros((height, width // 2 + 1), spectrum.dtype)
     resampled[:top, :half] = spectrum[:top, :half]
     resampled[height - bottom :, :half] = spectrum[old_height - bottom :, :half]

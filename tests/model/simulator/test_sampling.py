@@ -94,6 +94,14 @@ def test_a_wave_that_both_grids_hold_is_the_same_wave(
     assert_allclose(result, wave(height, width, cycles), rtol=0, atol=1e-3, strict=True)
 
 
+@pytest.mark.parametrize(("height", "width"), [(96, 72), (40, 33), (96, 33)])
+def test_rows_and_columns_are_resampled_alike(height: int, width: int) -> None:
+    """A half spectrum counts its inner columns twice, but not that of the Nyquist frequency."""
+    noise = scene(64, 48)
+    result = resample(noise, height, width)
+    assert_allclose(resample(noise.T, width, height), result.T, rtol=0, atol=1e-3)
+
+
 def test_frequencies_beyond_the_new_grid_are_cut_not_aliased() -> None:
     result = resample(wave(60, 84, (0, 30)), 40, 40)
     assert_allclose(result, np.full((40, 40), 100.0, np.float32), rtol=0, atol=1e-3, strict=True)
