@@ -5,6 +5,7 @@ compares a line with its neighbours, requires less than the share that blurred l
 spread to them, and weights the difference by the noise and texture around.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -41,6 +42,8 @@ For a thin bright line it is 0.70, 0.46, 0.27 and 0.02 if the MTF at Nyquist is 
 """
 SPREAD_SIGNIFICANT = 4.0
 """Standard errors of the covariance from which the spread of all lines is significant."""
+ERRORS = 2.0
+"""The number of standard errors in an interval of 95 %."""
 LINES = 16
 """The least number of lines from which their spread is determined."""
 WHITE = -0.35
@@ -76,7 +79,7 @@ class Stripes:
     Attributes:
         spread: standard deviation of the gains of all lines, without noise, as a share of the pixel
             value; None if it cannot be determined.
-        spread_error: the standard error of `spread`.
+        variance_error: the standard error of the square of `spread`, which is what is measured.
         significant: True if the spread is significant and relevant, and the lines deviate
             independently.
         off: single deviating lines, the largest deviation first.
@@ -84,10 +87,20 @@ class Stripes:
     """
 
     spread: float | None = None
-    spread_error: float = 0.0
+    variance_error: float = 0.0
     significant: bool = False
     off: tuple[Line, ...] = ()
     dead: tuple[int, ...] = ()
+
+    @property
+    def spread_interval(self) -> tuple[float, float]:
+        """The ends of the 95 % interval of `spread`; the lower one is 0 if the lines may be alike.
+
+        Errors of the variance are symmetric. Those of its root are not where it is near 0.
+        """
+        variance = (self.spread or 0.0) ** 2
+        reach = ERRORS * self.variance_error
+        return math.sqrt(max(variance - reach, 0.0)), math.sqrt(variance + reach)
 
     def renumbered(self, numbers: Sequence[int]) -> "Stripes":
         """Return the same faults with the line of index i called `numbers[i]`."""
@@ -121,12 +134,12 @@ def judge_lines(blocks: Blocks, least: float) -> Stripes:
     size = min(PARITY_LINES, gains.shape[1])
     gains = gains - uniform_filter1d(alternating, size, axis=1, mode="nearest") * sign
     mean, error = _combined(gains, errors)
-    spread, spread_error, significant = _spread(gains, errors)
+    spread, variance_error, significant = _spread(gains, errors)
     off = _single(mean, error, gains, errors, least)
     return Stripes(
         spread=spread,
-        spread_error=spread_error,
-        significant=significant and spread is not None and spread - spread_error > least,
+        variance_error=variance_error,
+        significant=significant and spread is not None and spread**2 - variance_error > least**2,
         off=tuple(line for line in off if line.index not in set(dead.tolist())),
         dead=tuple(dead.tolist()),
     )
@@ -148,8 +161,8 @@ def _combined(gains: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _spread(gains: np.ndarray, errors: np.ndarray) -> tuple[float | None, float, bool]:
-    """Return the standard deviation of independent lines' gains, its error, and whether it is
-    significant.
+    """Return the standard deviation of independent lines' gains, the error of its square, and
+    whether it is significant.
 
     Two halves of the blocks share the detectors, but neither noise nor scene. Their covariance is
     robust: a quarter of the difference between the variances of sum and difference, by median
@@ -170,9 +183,8 @@ def _spread(gains: np.ndarray, errors: np.ndarray) -> tuple[float | None, float,
     pairs = both[:-1] & both[1:]
     crossed = ((first[:-1], other[1:]), (other[:-1], first[1:]))
     next_one = np.mean([_covariance(left[pairs], right[pairs])[0] for left, right in crossed])
-    spread_error = float(error / (2 * SECOND * max(spread, np.sqrt(error / SECOND))))
     significant = covariance > SPREAD_SIGNIFICANT * error and next_one < WHITE * covariance
-    return spread, spread_error, bool(significant)
+    return spread, error / SECOND, bool(significant)
 
 
 def _covariance(first: np.ndarray, other: np.ndarray) -> tuple[float, float]:

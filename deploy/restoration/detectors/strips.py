@@ -194,8 +194,6 @@ SHARPENS = "restoration about doubles it"
 EQUALIZE = "equalise the image first"
 TRAIN = "or use a network that was trained with the effects prnu and dsnu"
 FIX = f"; `fix_detectors` {FOUND} replaces such "
-ERRORS = 2.0
-"""The number of standard errors in an interval of 95 %."""
 NAMED = 3
 """The largest number of places that a sentence names."""
 
@@ -309,6 +307,5 @@ def figures(bands: Sequence[BandFaults]) -> Mapping[str, Figure]:
 def _spread(lines: Stripes, how: str) -> Figure:
     if lines.spread is None:
         return unavailable("%", "too few lines or blocks along them")
-    # A spread is never negative, although its interval may reach below 0.
-    low, high = (max(lines.spread + sign * ERRORS * lines.spread_error, 0) for sign in (-1, 1))
+    low, high = lines.spread_interval
     return measured(100 * lines.spread, "%", how, (100 * low, 100 * high))

@@ -48,6 +48,18 @@ def test_the_spread_of_the_gains_is_measured(seed: int, width: int, rms: float) 
     assert faults.spread == pytest.approx(rms, rel=0.5)
 
 
+@pytest.mark.parametrize("rms", [0.0, 0.001])
+def test_the_interval_of_the_spread_holds_it_in_95_percent_of_images(rms: float) -> None:
+    """Where the lines are alike, too: there a spread below its error is drawn half of the time."""
+    held = 0
+    for seed in range(60):
+        generator = np.random.default_rng(seed)
+        gains = 1 + rms * generator.standard_normal(300)
+        low, high = judged(noisy(600 * gains * np.ones((256, 1)), generator)).spread_interval
+        held += low <= rms <= high
+    assert held >= 54  # 57 are expected, with a standard deviation of 1.7
+
+
 @settings(max_examples=20)
 @given(seeds, st.integers(4, 95), st.sampled_from([-0.2, -0.02, 0.01, 0.3]))
 def test_a_single_column_is_found_with_its_gain(seed: int, column: int, gain: float) -> None:
