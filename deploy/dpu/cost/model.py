@@ -7,6 +7,9 @@ layer   = longer of the two + (1 - overlap) shorter of the two + layer_s
 batch   = sum of layers
 host    = host_image_s + bytes in / rate + bytes out / rate + values of the task / its rate
 rate    = 1 / (dpu^q + host^q)^(1 / q), with q = contention_exponent
+
+The operand of an add or mul that does not fit on the chip is read serially: its memory takes
+SERIAL_PORT and SERIAL_DDR times as long.
 """
 
 import math
