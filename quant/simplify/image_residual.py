@@ -5,7 +5,7 @@ to the normalised image and undo the normalisation behind the sum:
 
     c (correction + a x + b) + d = c correction + x    if c a = 1 and c b + d = 0
 
-1. A Clip whose result is scaled and shifted becomes the last operation.
+1. A Clip whose result is scaled and shifted becomes the last operation, and so do Max and Min.
 2. A sum whose scaling returns the image becomes a sum with the image.
 
 The host then adds the image in float, and INT8 holds the small correction alone. In one small
@@ -19,13 +19,14 @@ import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.fold_affine import Affine, affine_chain
+from beers_deploy.quant.simplify.spelled_activations import joint_limits
 
 SAME = 1e-6
 """The relative error of constants that undo one another: a few roundings of float32."""
 
 
 def clip_last(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Let a Clip follow the arithmetic with one constant that ends a network (point 1).
+    """Let one Clip follow the arithmetic with one constant that ends a network (point 1).
 
     Args:
         graph: the graph that the node belongs to; its constants are extended.
@@ -33,33 +34,43 @@ def clip_last(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
     Returns:
         A product, a sum if there is a shift, and the Clip; None if the node does not end a network
-        in this way.
+        in this way, or is this Clip.
     """
     if node.result not in graph.outputs:
         return None
     source, affine = affine_chain(graph, node.result)
-    clip = graph.sole_writer(source)
-    if source == node.result or clip is None or clip.op_type != "Clip":
+    is_last = source == node.result
+    clip = node if is_last else graph.sole_writer(source)
+    clipped, *limits, count = joint_limits(graph, clip)
+    if (
+        clip is None
+        or not np.isfinite(limits).all()
+        or affine.channels > 1
+        or not affine.scale.all()
+    ):
         return None
-    limits = [graph.value(clip, place) for place in (1, 2)]
-    has_limits = all(limit is not None and limit.size == 1 for limit in limits)
-    if not has_limits or affine.channels > 1 or not affine.scale.all():
+    if is_last and count == 1:
         return None
     name = node.result
-    scale = graph.add_constant(f"{name}.scale", affine.scale)
     # A negative scale exchanges the two limits.
     low, high = sorted((affine.scale * limit + affine.shift).item() for limit in limits)
     ends = [
         graph.add_constant(f"{name}.low", np.array(low)),
         graph.add_constant(f"{name}.high", np.array(high)),
     ]
-    last = f"{name}.scaled"
-    nodes = [Node.new("Mul", [clip.source, scale], last)]
+    nodes = [] if is_last else _scaled(graph, clipped, name, affine)
+    last = nodes[-1].result if nodes else clipped
+    return [*nodes, Node.new("Clip", [last, *ends], name, clip.name)]
+
+
+def _scaled(graph: OnnxGraph, source: str, name: str, affine: Affine) -> list[Node]:
+    """Return the product, and the sum if there is a shift, that scale a tensor by one constant."""
+    scale = graph.add_constant(f"{name}.scale", affine.scale)
+    nodes = [Node.new("Mul", [source, scale], f"{name}.scaled")]
     if affine.shift.any():
         shift = graph.add_constant(f"{name}.shift", affine.shift)
-        last = f"{name}.shifted"
-        nodes.append(Node.new("Add", [nodes[0].result, shift], last))
-    return [*nodes, Node.new("Clip", [last, *ends], name, clip.name)]
+        nodes.append(Node.new("Add", [nodes[0].result, shift], f"{name}.shifted"))
+    return nodes
 
 
 def add_to_image(graph: OnnxGraph, node: Node) -> list[Node] | None:

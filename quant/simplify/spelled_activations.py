@@ -35,16 +35,7 @@ def join_clips(graph: OnnxGraph, node: Node) -> list[Node] | None:
         The activation, between a scaling and its inverse if it has other limits. None if the node
         is something else.
     """
-    low = -np.inf
-    high = np.inf
-    writer: Node | None = node
-    source = ""
-    count = 0
-    while writer is not None and (step := _limits(graph, writer)) is not None:
-        source, *limits = step
-        low, high = (float(np.clip(limit, low, high)) for limit in limits)
-        writer = graph.sole_writer(source)
-        count += 1
+    source, low, high, count = joint_limits(graph, node)
     result = node.result
     if count == 1 and (node.op_type == "Relu" or (low, high) == (0, 6)):
         return None
@@ -73,6 +64,28 @@ def join_clips(graph: OnnxGraph, node: Node) -> list[Node] | None:
         Node.new("Mul", [clipped, constant("unit", unit)], times),
         Node.new("Add", [times, constant("low", low)], result, f"{result}.raised"),
     ]
+
+
+def joint_limits(graph: OnnxGraph, node: Node | None) -> tuple[str, float, float, int]:
+    """Return what a node and those in front of it, which only clip, have in common.
+
+    Args:
+        graph: the graph that the node belongs to.
+        node: the last of the nodes; None returns no name and a count of 0.
+
+    Returns:
+        The tensor that is clipped, its low and its high limit, and the number of nodes.
+    """
+    low = -np.inf
+    high = np.inf
+    source = ""
+    count = 0
+    while node is not None and (step := _limits(graph, node)) is not None:
+        source, *limits = step
+        low, high = (float(np.clip(limit, low, high)) for limit in limits)
+        node = graph.sole_writer(source)
+        count += 1
+    return source, low, high, count
 
 
 def _limits(graph: OnnxGraph, node: Node) -> tuple[str, float, float] | None:
