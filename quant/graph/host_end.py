@@ -21,6 +21,7 @@ from beers_deploy.quant.graph.operations import SIX, Shuffle
 from beers_deploy.quant.input_range import is_range
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.resize import CUBIC, Resizing
+from beers_deploy.quant.simplify.slices import slices_of
 
 ACTIVATIONS = {"Sigmoid", "Tanh"}
 
@@ -100,10 +101,10 @@ def _crop_px(graph: OnnxGraph, result: str) -> int:
     node = graph.sole_writer(result)
     if node is None or node.op_type != "Slice":
         return 0
-    starts, stops, axes = (graph.numbers(node, place, "") or [0] for place in (1, 2, 3))
-    crop_px = int(starts[0])
-    is_crop = axes == [2, 3] and starts == [crop_px] * 2 and stops == [-crop_px] * 2
-    return crop_px if is_crop else 0
+    cuts = slices_of(graph, node)
+    crop_px = cuts[2].start if 2 in cuts else 0
+    both_sides = slice(crop_px, -crop_px, 1)
+    return crop_px if cuts == {2: both_sides, 3: both_sides} else 0
 
 
 def _limits(graph: OnnxGraph, result: str, limits: tuple[float, ...]) -> tuple[float, ...]:

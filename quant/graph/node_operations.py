@@ -24,6 +24,7 @@ from beers_deploy.quant.graph.split_network import ADAPT, ADAPT_EXACTLY, REMEDY,
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.resize import Resizing, alone_enlarges_image
 from beers_deploy.quant.onnx.window import Pair, Window
+from beers_deploy.quant.simplify.convolutions import leaves_pads
 
 PAD_STRIDES = (
     "Pad strided convolutions and pools, so that their result has a half or a quarter of the size, "
@@ -111,11 +112,10 @@ def _check_transposed(node: Node) -> None:
 
 def _window(node: Node, kernel: Sequence[int] = ()) -> tuple[Pair, Window]:
     kernel_and_window = node.window(kernel)
-    auto_pad = str(node.attributes.get("auto_pad", ""))
     if kernel_and_window is None:
         raise unsupported(f"{node} must have a window over rows and columns.")
-    has_pads = kernel_and_window[1].strides == (1, 1) or not auto_pad.startswith("SAME")
-    require(has_pads, node, f"must state its pads instead of auto_pad {auto_pad} with strides")
+    rule = f"must state its pads instead of auto_pad {node.attributes.get('auto_pad')} with strides"
+    require(not leaves_pads(node), node, rule)
     return kernel_and_window
 
 

@@ -3,15 +3,15 @@
 Exporters from TensorFlow transpose the image in front of the first convolution, and the result at
 the end. Linear layers of torch stand between two such nodes.
 
-1. A Transpose to channels last is moved behind operations on each value, concats, padding, means,
-   and products with a matrix, which become convolutions of one pixel. A LayerNormalization over the
-   channels is spelled out for that. A Transpose to channels first then undoes it.
+1. A Transpose to channels last is moved behind operations on each value, concats, splits, padding,
+   means, and products with a matrix, which become convolutions of one pixel. A LayerNormalization
+   over the channels is spelled out for that. A Transpose to channels first then undoes it.
 2. If the image has its channels last, it is treated as one of channels first that is transposed
    before anything else. The result is treated likewise.
+3. A map that is flattened to (N H W, C) for a product with a matrix is multiplied itself.
 """
 
 from collections.abc import Mapping
-from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,9 @@ ON_VALUES = {
     *("Relu", "Sigmoid", "Softplus", "Sqrt", "Sub", "Sum", "Tanh"),
 }
 """Operators on each value, which no order of axes changes."""
+REDUCING = {"ReduceMax", "ReduceMean", "ReduceSum"}
+ON_ANY_AXIS = {*ON_VALUES, *REDUCING, "Concat", "MatMul", "Pad", "Reshape", "Slice", "Split"}
+"""Operators that do not show which axis has the channels."""
 
 
 def channels_first(model: ModelProto) -> None:
@@ -37,43 +40,60 @@ def channels_first(model: ModelProto) -> None:
     Args:
         model: a float network, which is changed in place.
     """
-    if not any(_is_transpose(node, TO_FIRST) for node in OnnxGraph(model).nodes):
+    graph = OnnxGraph(model)
+    if not any(
+        _is_transpose(node, TO_FIRST) or _is_transpose(node, TO_LAST) for node in graph.nodes
+    ):
         return
-    network = deepcopy(model)
-    graph = OnnxGraph(network)
-    for name in graph.inputs:
+    images = _images_of_channels_last(graph)
+    for name in images:
         first = Node.new("Transpose", [name], f"{name}.last", perm=TO_LAST)
         for node in graph.readers[name]:
             node.inputs = tuple(first.result if each == name else each for each in node.inputs)
         graph.set_nodes([first, *graph.nodes])
-    graph.rewrite(_moved_behind)
-    graph.save()
-    ends = [node for node in graph.nodes if _is_transpose(node, TO_LAST)]
-    if any(node.result not in graph.outputs for node in ends):
-        # The image has its channels first.
-        graph = OnnxGraph(model)
-        graph.rewrite(_moved_behind)
-        graph.save()
-        return
-    results = [node.result for node in ends]
-
+    graph.rewrite(moved_behind)
+    ends = {node.result for node in graph.nodes if _is_last(graph, node)}
     graph.rewrite(
-        lambda _, node: (
-            [node.replaced_by("Identity", node.inputs)] if node.result in results else None
-        )
+        lambda _, node: [node.replaced_by("Identity", node.inputs)] if node.result in ends else None
     )
     graph.save()
-    for value in (*network.graph.input, *network.graph.output):
+    for value in (*model.graph.input, *model.graph.output):
         dims = value.type.tensor_type.shape.dim
-        if len(dims) == 4 and (value.name in graph.inputs or value.name in results):
+        if len(dims) == 4 and value.name in images | ends:
             channels = dims.pop()
             dims.insert(1, channels)
-    network.graph.ClearField("value_info")
-    model.CopyFrom(network)
+            model.graph.ClearField("value_info")
 
 
-def _moved_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Move the Transposes to channels last in front of a node behind it (1)."""
+def _is_last(graph: OnnxGraph, node: Node) -> bool:
+    """Return True if a node transposes a result of the network to channels last."""
+    return node.result in graph.outputs and _is_transpose(node, TO_LAST)
+
+
+def _images_of_channels_last(graph: OnnxGraph) -> set[str]:
+    """Return the inputs that are transposed to channels first before any operator of maps."""
+    origins = {name: {name} for name in graph.inputs}
+    images: set[str] = set()
+    for node in graph.nodes:
+        reached = set[str]().union(*(origins.get(name, ()) for name in node.inputs))
+        if _is_transpose(node, TO_FIRST):
+            images |= reached
+        elif node.op_type in ON_ANY_AXIS:
+            origins.update(dict.fromkeys(node.outputs, reached))
+    return images
+
+
+def moved_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Move the Transposes to channels last in front of a node behind it (1).
+
+    Args:
+        graph: the graph that the node belongs to; its constants are extended.
+        node: any node.
+
+    Returns:
+        The operation on maps of channels first, and a Transpose of each result; None if the node
+        stays.
+    """
     names = [name for name in node.inputs if name and name not in graph.constants]
     writers = [graph.writers.get(name) for name in names]
     sources = {
@@ -81,20 +101,76 @@ def _moved_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
         for writer in writers
         if writer is not None and _is_transpose(writer, TO_LAST)
     }
-    if not names or sources.keys() != {*names} or len(node.outputs) > 1:
+    if _is_one_pixel(graph, node):
+        return _transposed(node, _of_one_pixel(graph, node))
+    is_single = len(node.outputs) == 1 or node.op_type == "Split"
+    if not names or sources.keys() != {*names} or not is_single:
         return None
-    (result,) = node.outputs
     if _is_transpose(node, TO_FIRST):
         return [node.replaced_by("Identity", [*sources.values()])]
-    first = f"{result}.first"
+    first = f"{node.result}.first"
     if node.op_type == "LayerNormalization":
-        moved = _layer_normalization(graph, node, sources[node.source], first)
-    else:
-        on_first = _on_first(graph, node, sources, first)
-        moved = [] if on_first is None else [on_first]
+        return _transposed(node, _layer_normalization(graph, node, sources[node.source], first))
+    on_first = _on_first(graph, node, sources, first)
+    return None if on_first is None else _transposed(node, [on_first])
+
+
+def _transposed(node: Node, moved: list[Node]) -> list[Node] | None:
+    """Return nodes that compute the results of a node with channels first, and their Transposes;
+    None if there are no such nodes.
+    """
     if not moved:
         return None
-    return [*moved, Node.new("Transpose", [first], result, f"{result}.last", perm=TO_LAST)]
+    moved[-1].outputs = tuple(f"{name}.first" for name in node.outputs)
+    firsts = zip(node.outputs, moved[-1].outputs, strict=True)
+    return [
+        *moved,
+        *(
+            Node.new("Transpose", [first], name, f"{name}.last", perm=TO_LAST)
+            for name, first in firsts
+        ),
+    ]
+
+
+def _is_one_pixel(graph: OnnxGraph, node: Node) -> bool:
+    """Return True if a Reshape makes one pixel of channels last, for arithmetic with such maps."""
+    sizes = graph.numbers(node, 1, "") if node.op_type == "Reshape" else []
+    others = [name for reader in graph.readers[node.result] for name in reader.inputs]
+    writers = [graph.writers.get(name) for name in others]
+    return (sizes or [])[1:3] == [1, 1] and any(
+        writer is not None and _is_transpose(writer, TO_LAST) for writer in writers
+    )
+
+
+def _of_one_pixel(graph: OnnxGraph, node: Node) -> list[Node]:
+    """Return the Reshape to one pixel of channels first, whose values have the same order."""
+    batch, *_, channels = graph.numbers(node, 1, "") or ()
+    sizes = graph.add_constant(f"{node.result}.sizes", np.array([batch, channels, 1, 1]), np.int64)
+    return [node.replaced_by("Reshape", [node.source, sizes], **node.attributes)]
+
+
+def multiplied(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Multiply a map of channels last by a matrix, in place of the same map flattened (3).
+
+    Args:
+        graph: the graph that the node belongs to, which knows its sizes.
+        node: any node; the Reshape to a map is replaced.
+
+    Returns:
+        The product; None if the node is something else.
+    """
+    product = graph.writers.get(node.source)
+    if node.op_type != "Reshape" or product is None or product.op_type != "MatMul":
+        return None
+    flat = graph.writers.get(product.source)
+    if flat is None or flat.op_type != "Reshape":
+        return None
+    names = flat.source, product.source, node.result
+    before, rows, after = (graph.shapes.get(name, ()) for name in names)
+    is_map = len(before) == len(after) == 4 and before[:3] == after[:3] and len(rows) == 2
+    if not is_map or before[3] != rows[1]:
+        return None
+    return [node.replaced_by("MatMul", [flat.source, product.inputs[1]])]
 
 
 def _on_first(graph: OnnxGraph, node: Node, sources: Mapping[str, str], first: str) -> Node | None:
@@ -121,7 +197,7 @@ def _on_first(graph: OnnxGraph, node: Node, sources: Mapping[str, str], first: s
         pads[:, places] = number.reshape(2, -1)
         name = graph.add_constant(f"{first}.pads", pads.ravel(), number.dtype)
         return Node.new(kind, [source, name, *node.inputs[2:3]], first, node.name, **attributes)
-    if kind == "ReduceMean" and attributes.get("keepdims", 1):
+    if kind in REDUCING and attributes.get("keepdims", 1):
         axes = graph.numbers(node, 1, "axes")
         moved_axes = [TO_LAST[axis % 4] for axis in axes or ()]
         inputs = [source]
@@ -130,10 +206,12 @@ def _on_first(graph: OnnxGraph, node: Node, sources: Mapping[str, str], first: s
         else:
             inputs.append(graph.add_constant(f"{first}.axes", np.array(moved_axes), np.int64))
         return Node.new(kind, inputs, first, node.name, **attributes) if axes else None
-    if kind not in ON_VALUES and kind != "Concat":
+    if kind in ("Concat", "Split"):
+        attributes["axis"] = TO_LAST[attributes.get("axis", 0) % 4]
+    elif kind not in ON_VALUES:
         return None
-    if kind == "Concat":
-        attributes["axis"] = TO_LAST[attributes["axis"] % 4]
+    if kind == "Split":
+        return Node.new(kind, [source, *node.inputs[1:]], first, node.name, **attributes)
     inputs = [sources.get(name) or _of_first(graph, name) for name in node.inputs]
     return Node.new(kind, inputs, first, node.name, **attributes)
 

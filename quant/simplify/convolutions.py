@@ -9,6 +9,8 @@
    last one.
 4. A convolution of one pixel sums the parts, channel by channel. Behind a sum by Adds a DPU has no
    activation but ReLU, and as the network's last operation it would have 8 bits.
+5. A crop behind a transposed convolution becomes padding of that. TensorFlow crops the map that it
+   enlarges to a multiple of its size.
 
 All of it is exact except for the rounding of float32. A DPU also multiplies by the zeros of 1 and
 2. Where a part of a large kernel would begin or end inside the map, as with a kernel without
@@ -22,6 +24,7 @@ import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.fold_affine import is_convolution
+from beers_deploy.quant.simplify.slices import TO_THE_END, slices_of
 
 MOST_POSITIONS = 49
 """The maximum height times width of a part, 7 x 7. The smallest limit of a target is 53."""
@@ -31,6 +34,12 @@ them.
 """
 LONGEST_SIDE = 16
 """The longest side of a kernel that is split although a side has no padding."""
+
+
+def leaves_pads(node: Node) -> bool:
+    """Return True if the pads of a strided convolution or pool follow from the size of its map."""
+    is_same = str(node.attributes.get("auto_pad", "")).startswith("SAME")
+    return is_same and any(stride > 1 for stride in node.attributes.get("strides", [1]))
 
 
 def without_groups(graph: OnnxGraph, node: Node) -> list[Node] | None:
@@ -77,6 +86,34 @@ def without_groups(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return [Node.new(node.op_type, inputs, node.result, node.proto.name, **attributes)]
 
 
+def crop_by_pads(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace a crop behind a transposed convolution by padding, which also cuts its result.
+
+    Args:
+        graph: the graph that the node belongs to.
+        node: any node; the Slice is replaced.
+
+    Returns:
+        The convolution; None if the node is something else.
+    """
+    before = graph.sole_writer(node.source) if node.op_type == "Slice" else None
+    cuts = slices_of(graph, node) if before is not None else {}
+    if before is None or before.op_type != "ConvTranspose" or not cuts.keys() <= {2, 3}:
+        return None
+    states_pads = before.attributes.get("auto_pad", "NOTSET") == "NOTSET"
+    pads = list(before.attributes.get("pads", [0] * 4))
+    for axis, cut in cuts.items():
+        # Stops count from the end.
+        stop = 0 if cut.stop >= TO_THE_END else cut.stop
+        if cut.step != 1 or cut.start < 0 or stop > 0:
+            return None
+        pads[axis - 2] += cut.start
+        pads[axis] -= stop
+    if not cuts or not states_pads or "output_shape" in before.attributes:
+        return None
+    return [node.replaced_by("ConvTranspose", before.inputs, **{**before.attributes, "pads": pads})]
+
+
 def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a convolution of a large kernel by several of smaller ones, and the sum of their
     results.
@@ -93,12 +130,13 @@ def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
         return None
     weight = graph.constants[node.inputs[1]]
     outputs, channels, rows, columns = weight.shape
-    states_pads = node.attributes.get("auto_pad", "NOTSET") == "NOTSET"
     channels *= node.groups
-    pads = node.attributes.get("pads", [0, 0, 0, 0])
-    is_large = rows * columns > LARGE_POSITIONS
-    is_whole_map = min(pads) == 0 and max(rows, columns) > LONGEST_SIDE
-    if not (is_large and states_pads and columns <= MOST_POSITIONS) or is_whole_map:
+    is_large = rows * columns > LARGE_POSITIONS and columns <= MOST_POSITIONS
+    match = node.window((rows, columns))
+    if not is_large or match is None or leaves_pads(node):
+        return None
+    pads = match[1].pads
+    if min(pads) == 0 and max(rows, columns) > LONGEST_SIDE:
         return None
     # A part may have MOST_POSITIONS // columns rows, so this is the least number of parts.
     step = -(-rows // (MOST_POSITIONS // columns))
@@ -123,6 +161,7 @@ def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
         attributes = {
             **node.attributes,
             "kernel_shape": list(kernel.shape[2:]),
+            "auto_pad": "NOTSET",
             "pads": [max(above, 0), pads[1], max(below, 0), pads[3]],
             "dilations": [step * dilations[0], dilations[1]],
         }

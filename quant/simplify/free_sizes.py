@@ -3,9 +3,9 @@ them.
 
 1. Set the free sizes of the image to numbers, so that the runtime folds arithmetic on shapes.
 2. Write a Resize to a size as one by factors, pads in place of auto_pad SAME, and what only moves
-   and repeats values as one operator (`rearrangements`). Remove a Pad by nothing, a Slice of the
-   whole map, and an Expand that arithmetic does anyway. Let a convolution repeat a channel, and
-   write a map of one number per channel, such as a noise level.
+   and repeats values as one operator (`rearrangements`). Let crops count from the end. Remove a
+   Pad by nothing, a Slice of the whole map, and an Expand that arithmetic does anyway. Let a
+   convolution repeat a channel, and write a map of one number per channel, such as a noise level.
 3. Do both for two sizes. If the networks are equal, the size has no effect, and theirs is the
    network of every image whose sides are multiples of `MULTIPLE_PX`. Otherwise the network is not
    changed.
@@ -26,6 +26,8 @@ from onnx import ModelProto
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Rewriting, sizes_of
 from beers_deploy.quant.onnx.image_input import without_size
+from beers_deploy.quant.simplify.channels_first import moved_behind, multiplied
+from beers_deploy.quant.simplify.convolutions import leaves_pads
 from beers_deploy.quant.simplify.fold_affine import affine_chain
 from beers_deploy.quant.simplify.rearrangements import (
     OF_BLOCKS,
@@ -34,13 +36,14 @@ from beers_deploy.quant.simplify.rearrangements import (
     rearranged,
     takes_others,
 )
+from beers_deploy.quant.simplify.slices import TO_THE_END, slices_of
 
 MULTIPLE_PX = 64
 """Six levels of a U-Net halve sides of this length without a remainder."""
 SIZES_PX = (2 * MULTIPLE_PX, 3 * MULTIPLE_PX), (4 * MULTIPLE_PX, 3 * MULTIPLE_PX)
 """Rows and columns differ, so that a network that confuses them is detected."""
-SIZED = {"Concat", "Expand", "Pad", "Resize", "Shape", "Size", "Slice"}
-"""Operators that may need the size of an image."""
+SIZED = {"Concat", "Expand", "MatMul", "Pad", "Resize", "Shape", "Size", "Slice"}
+"""Operators that may need the size of an image, or read a map that is flattened."""
 LOCAL = {
     *("Add", "AveragePool", "Clip", "Concat", "Conv", "ConvTranspose", "DepthToSpace", "Div"),
     *("HardSigmoid", "HardSwish", "LeakyRelu", "MaxPool", "Mul", "Pad", "PRelu", "Relu", "Resize"),
@@ -85,7 +88,7 @@ def free_sizes(model: ModelProto, fold: Fold) -> ModelProto:
     if not any(
         is_rearrangement(graph, node)
         or node.attributes.get("keepdims", 1) == 0
-        or _leaves_pads(node)
+        or leaves_pads(node)
         or (node.op_type in SIZED and (node.op_type != "Concat" or constants & {*node.inputs}))
         for node in graph.nodes
     ):
@@ -134,6 +137,7 @@ def _of_size(model: ModelProto, rows: int, columns: int, fold: Fold) -> ModelPro
     graph = OnnxGraph(network)
     graph.shapes = {name: sizes_of(tensor) for name, tensor in graph.tensor_types().items()}
     graph.rewrite(_sized)
+    graph.rewrite(moved_behind)
     graph.save()
     return fold(network)
 
@@ -153,20 +157,40 @@ def _sized(graph: OnnxGraph, node: Node) -> list[Node] | None:
     after = graph.shapes.get(node.result, ())
     moves = node.op_type == "Transpose" or takes_others(graph, node)
     if moves or (node.op_type in RESHAPING and before != after):
-        return _with_kept_axis(graph, node) or rearranged(graph, node)
+        return multiplied(graph, node) or _with_kept_axis(graph, node) or rearranged(graph, node)
     if len(before) != 4 or len(after) != 4 or min(*before, *after) < 1:
         return None
     if node.op_type in SPECIAL:
         return SPECIAL[node.op_type](graph, node)
-    keeps_all = (
-        node.op_type == "Slice"
-        and before == after
-        and all(step == 1 for step in graph.numbers(node, 4, "steps") or ())
-    )
     adds_nothing = node.op_type == "Pad" and graph.numbers(node, 1, "pads") == [0] * 8
-    if keeps_all or adds_nothing or node.op_type in RESHAPING:
+    if adds_nothing or node.op_type in RESHAPING:
         return [node.replaced_by("Identity", [source])]
     return None
+
+
+def _cropped(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Return a crop whose stops count from the end of rows and columns, as those of all sizes do;
+    nothing but another name for a Slice of the whole map, and None for other Slices.
+    """
+    before = graph.shapes[node.source]
+    cuts = slices_of(graph, node)
+    if any(cut.step != 1 for cut in cuts.values()):
+        return None
+    if before == graph.shapes[node.result]:
+        return [node.replaced_by("Identity", [node.source])]
+    if cuts.keys().isdisjoint((2, 3)):
+        return None
+    stops = {axis: cut.indices(before[axis])[1] - before[axis] for axis, cut in cuts.items()}
+    numbers = (
+        [cut.start for cut in cuts.values()],
+        [stops[axis] or TO_THE_END if axis > 1 else cut.stop for axis, cut in cuts.items()],
+        list(cuts),
+    )
+    places = [
+        graph.add_constant(f"{node.name}.{role}", np.array(values), np.int64)
+        for role, values in zip(("starts", "stops", "axes"), numbers, strict=True)
+    ]
+    return [node.replaced_by("Slice", [node.source, *places])]
 
 
 def _with_pads(graph: OnnxGraph, node: Node) -> list[Node] | None:
@@ -174,17 +198,10 @@ def _with_pads(graph: OnnxGraph, node: Node) -> list[Node] | None:
     weight = graph.value(node, 1)
     _, _, rows, columns = graph.shapes[node.source]
     match = node.window(() if weight is None else weight.shape[2:], (rows, columns))
-    if match is None or not _leaves_pads(node):
+    if match is None or not leaves_pads(node):
         return None
     attributes = {**node.attributes, "auto_pad": "NOTSET", "pads": list(match[1].pads)}
     return [node.replaced_by(node.op_type, node.inputs, **attributes)]
-
-
-def _leaves_pads(node: Node) -> bool:
-    """Return True if the pads of a strided window follow from the size of its map."""
-    return str(node.attributes.get("auto_pad", "")).startswith("SAME") and any(
-        stride > 1 for stride in node.attributes.get("strides", [1])
-    )
 
 
 def _by_factors(graph: OnnxGraph, node: Node) -> list[Node] | None:
@@ -271,6 +288,7 @@ SPECIAL: dict[str, Rewriting] = {
     "Concat": _with_written_maps,
     "Expand": _expanded,
     "Resize": _by_factors,
+    "Slice": _cropped,
     **dict.fromkeys(("AveragePool", "Conv", "MaxPool"), _with_pads),
 }
 """The function for each operator that returns the nodes which replace one."""

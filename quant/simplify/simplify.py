@@ -59,7 +59,11 @@ from beers_deploy.quant.simplify.channels import (
     split_channels,
 )
 from beers_deploy.quant.simplify.channels_first import channels_first
-from beers_deploy.quant.simplify.convolutions import split_large_kernel, without_groups
+from beers_deploy.quant.simplify.convolutions import (
+    crop_by_pads,
+    split_large_kernel,
+    without_groups,
+)
 from beers_deploy.quant.simplify.fold_affine import (
     add_negated,
     convolve_affine,
@@ -189,6 +193,7 @@ def _run_passes(model: ModelProto) -> None:
         add_negated,
         add_to_image,
         join_sigmoid,
+        crop_by_pads,
         fold_behind,
         without_groups,
         split_large_kernel,

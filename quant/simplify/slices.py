@@ -39,8 +39,11 @@ def slices_of(graph: OnnxGraph, node: Node) -> dict[int, slice]:
     if not (starts and stops and axes) or steps is None:
         return {}
     steps = steps or [1] * len(axes)
-    cuts = map(slice, starts, stops, steps)
-    return {axis % 4: cut for axis, cut in zip(axes, cuts, strict=True)}
+    return {
+        axis % 4: slice(*cut)
+        for axis, *cut in zip(axes, starts, stops, steps, strict=True)
+        if cut[0] or cut[1] < TO_THE_END or cut[2] != 1
+    }
 
 
 def unshuffle_slices(graph: OnnxGraph, node: Node) -> list[Node] | None:

@@ -195,12 +195,19 @@ def drop_cast_or_reshape(graph: OnnxGraph, node: Node) -> list[Node] | None:
     if size is None or graph.sole_writer(node.source) is None:
         return None
     is_cast = node.op_type == "Cast" and node.attributes["to"] == TensorProto.FLOAT
-    # One free side follows from the others.
-    keeps_size = size == graph.shapes.get(node.result) and size.count(0) < 2
-    if not is_cast and not (node.op_type == "Reshape" and keeps_size):
+    if not is_cast and not (node.op_type == "Reshape" and _keeps_sides(graph, node, size)):
         return None
     graph.rename(node.source, node.result)
     return []
+
+
+def _keeps_sides(graph: OnnxGraph, node: Node, sides: tuple[int, ...]) -> bool:
+    """Return True if a Reshape states the sides that its tensor has: 0 copies a side, and the one
+    that is -1 follows from the others.
+    """
+    stated = graph.numbers(node, 1, "") or ()
+    is_kept = [number in (0, -1, side) for number, side in zip(stated, sides, strict=False)]
+    return len(stated) == len(sides) and all(is_kept) and not node.attributes.get("allowzero", 0)
 
 
 def pool_mean(graph: OnnxGraph, node: Node) -> list[Node] | None:

@@ -92,6 +92,34 @@ def test_channels_that_are_last_between_other_layers_become_first(
     assert_allclose(run_model(short, image), before, rtol=1e-4)
 
 
+KERAS = {
+    "half of the channels times the other": "s, t = Split<axis=-1>(u) m = Mul(s, t) v = Add(m, t)",
+    "a dense layer": """f = Reshape(u, flat) p = MatMul(f, square) s = Shape(u)
+        e = Gather(s, edges) t = Concat<axis=0>(e, four) r = Reshape(p, t) v = Relu(r)""",
+    "squeeze and excite by dense layers": """p = GlobalAveragePool(x) q = Squeeze(p, axes)
+        g = MatMul(q, square) a = Add(g, b) r = Reshape(a, pixel) v = Mul(u, r)""",
+}
+"""Layers of Keras on the tensor u, which has its channels last."""
+
+
+@pytest.mark.parametrize("layer", KERAS)
+def test_keras_layers_of_channels_last_become_first(layer: str) -> None:
+    """The result has its channels last, the image has not, as with tf2onnx's inputs_as_nchw."""
+    model = network_from(
+        f"""u = Transpose<perm=[0,2,3,1]>(x) {KERAS[layer]}
+        z = Transpose<perm=[0,3,1,2]>(v) c = Relu(z) y = Transpose<perm=[0,2,3,1]>(c)""",
+        ends=f"float[N,{CHANNELS},H,W] x => float[N,H,W,C] y",
+        flat=[-1, CHANNELS],
+        edges=[0, 1, 2],
+        pixel=[-1, 1, 1, CHANNELS],
+    )
+    short = simplify(model, "a.onnx")
+    left = {node.op_type for node in short.graph.node}
+    assert left <= {"Add", "Conv", "GlobalAveragePool", "Mul", "Relu"}
+    before = np.moveaxis(run_model(model, IMAGE), 3, 1)
+    assert_allclose(run_model(short, IMAGE), before, rtol=1e-4)
+
+
 @pytest.mark.parametrize(
     ("axes", "pads"), [([1], [1, 2]), ([-2, -3], [0, 1, 2, 0]), ([2, 1, 0, 3], [1, 2, *[0] * 6])]
 )
@@ -110,6 +138,19 @@ def test_pads_of_channels_last_may_name_their_axes(axes: list[int], pads: list[i
     # ONNX's reference gives the expected result.
     (before,) = ReferenceEvaluator(model).run(None, {"x": IMAGE})
     assert_allclose(run_model(short, IMAGE), np.asarray(before), rtol=1e-4)
+
+
+def test_a_crop_to_a_multiple_of_the_image_is_padding() -> None:
+    """TensorFlow computes the stops of the crop behind a transposed convolution from the size."""
+    model = network_from(
+        """u = ConvTranspose<strides=[2,2]>(x, w) s = Shape(x) h = Slice(s, two, four)
+        ends = Mul(h, doubled) d = Slice(u, starts, ends, axes) y = Relu(d)""",
+        doubled=[2, 2],
+        starts=[0, 1],
+    )
+    short = simplify(model, "a.onnx")
+    assert [node.op_type for node in short.graph.node] == ["ConvTranspose", "Relu"]
+    assert_same(model, short, IMAGE, rtol=1e-5)
 
 
 def test_pads_that_follow_from_an_even_size_are_stated() -> None:

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import onnx
+import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
@@ -90,14 +91,15 @@ def test_a_large_kernel_is_several_small_ones_and_their_sum(
     assert_same(model, short, *size)
 
 
-def test_srresnets_kernels_of_9_x_9_are_two_and_a_sum() -> None:
+@pytest.mark.parametrize("pads", ["pads=[4,4,4,4]", 'auto_pad="SAME_UPPER"'])
+def test_srresnets_kernels_of_9_x_9_are_two_and_a_sum(pads: str) -> None:
     """SRResNet's first layer becomes two parts, their concatenation, and the convolution that sums
-    them.
+    them, also as TensorFlow pads it.
 
     The last one keeps the name of the layer and has its ReLU, so that reports name what users know.
     """
     weight = drawn(np.random.default_rng(0), CHANNELS, CHANNELS, 9, 9)
-    model = network_from("[head] c = Conv<pads=[4,4,4,4]>(x, w) y = Relu(c)", ends=ENDS, w=weight)
+    model = network_from(f"[head] c = Conv<{pads}>(x, w) y = Relu(c)", ends=ENDS, w=weight)
     short = simplify(model, "a.onnx")
     names = [op.name for op in read_network(short).graph]
     assert names == ["head.rows_0", "head.rows_1", "head.rows", "head"]
