@@ -35,11 +35,11 @@ from beers_deploy.profiles.errors import (
     reason_of,
 )
 from beers_deploy.profiles.toml import read_whole, unreadable
-from beers_deploy.quant.domains import IR_VERSION, MICROSOFT, OPSET, opset_of
+from beers_deploy.quant.domains import IR_VERSION, MICROSOFT, OPSET, STANDARD, opset_of
 from beers_deploy.quant.onnx.external_weights import take_in
 from beers_deploy.quant.onnx.graph import OnnxGraph
 from beers_deploy.quant.onnx.node_order import sort_nodes
-from beers_deploy.quant.onnx.runnable import check_runnable
+from beers_deploy.quant.onnx.runnable import check_runnable, named
 from beers_deploy.quant.simplify.simplify import simplify
 from beers_deploy.quant.simplify.training_mode import require_inference
 from beers_deploy.quant.untrusted import FILE_BYTES, check_content
@@ -134,7 +134,7 @@ def parse_onnx(
         # Before onnx's checker, which opens the files that hold external weights.
         check_content(model, where)
         sort_nodes(model.graph)
-        onnx.checker.check_model(model)
+        _check(model, where)
     except BeersError:
         raise
     except (DecodeError, onnx.checker.ValidationError, ValueError) as error:
@@ -150,6 +150,24 @@ def parse_onnx(
     if to_run:
         check_runnable(model, where)
     return model
+
+
+def _check(model: ModelProto, where: str) -> None:
+    """Apply onnx's checker, but let results have no sizes, as tools leave those that they add."""
+    for node in model.graph.node:
+        if node.domain in STANDARD and not onnx.defs.has(node.op_type):
+            raise ModelError(
+                f"{where} uses {printable(named(node))}, but ONNX has no such operator: the "
+                "exporter could not translate a layer. Write that layer in another way, and "
+                "export the network again."
+            )
+    tensors = [value.type.tensor_type for value in model.graph.output]
+    open_tensors = [tensor for tensor in tensors if not tensor.HasField("shape")]
+    for tensor in open_tensors:
+        tensor.shape.SetInParent()
+    onnx.checker.check_model(model)
+    for tensor in open_tensors:
+        tensor.ClearField("shape")
 
 
 def require_onnx_name(*paths: Path | None) -> None:

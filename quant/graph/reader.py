@@ -48,6 +48,7 @@ from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.resize import Resizing
 from beers_deploy.quant.onnx.runnable import check_runnable
 from beers_deploy.quant.simplify.fold_affine import affine_of
+from beers_deploy.quant.simplify.simplify import simplify
 from beers_deploy.quant.simplify.standard_operators import float_shapes
 from beers_deploy.quant.untrusted import contradictions, times
 
@@ -120,6 +121,8 @@ def refusal(model: ModelProto) -> str:
     """Return a sentence for a user on why a float network cannot be quantised; "" if it can."""
     try:
         check_runnable(model, "the float network")
+        # A file that cannot be simplified is inspected as it is, and would be quantised by nobody.
+        simplify(model, "the float network")
         read_network(model)
     except ModelError as error:
         # `check` calls this too, and need not be recommended to its own user.

@@ -47,27 +47,41 @@ def channels_first(model: ModelProto) -> None:
         return
     images = _images_of_channels_last(graph)
     for name in images:
+        _read_instead(graph, name, f"{name}.last")
         first = Node.new("Transpose", [name], f"{name}.last", perm=TO_LAST)
-        for node in graph.readers[name]:
-            node.inputs = tuple(first.result if each == name else each for each in node.inputs)
         graph.set_nodes([first, *graph.nodes])
     graph.rewrite(moved_behind)
-    ends = {node.result for node in graph.nodes if _is_last(graph, node)}
-    graph.rewrite(
-        lambda _, node: [node.replaced_by("Identity", node.inputs)] if node.result in ends else None
-    )
+    results = {name for name in graph.outputs if _is_last(graph, name, bool(images))}
+    for name in results:
+        _read_instead(graph, name, f"{name}.last")
+        graph.rename(name, f"{name}.last")
+        first = Node.new("Transpose", [f"{name}.last"], name, f"{name}.first", perm=TO_FIRST)
+        graph.set_nodes([*graph.nodes, first])
+    graph.rewrite(moved_behind)
     graph.save()
     for value in (*model.graph.input, *model.graph.output):
         dims = value.type.tensor_type.shape.dim
-        if len(dims) == 4 and value.name in images | ends:
+        if len(dims) == 4 and value.name in images | results:
             channels = dims.pop()
             dims.insert(1, channels)
             model.graph.ClearField("value_info")
 
 
-def _is_last(graph: OnnxGraph, node: Node) -> bool:
-    """Return True if a node transposes a result of the network to channels last."""
-    return node.result in graph.outputs and _is_transpose(node, TO_LAST)
+def _read_instead(graph: OnnxGraph, name: str, other: str) -> None:
+    """Let all readers of a tensor read another one instead."""
+    for node in graph.readers[name]:
+        node.inputs = tuple(other if each == name else each for each in node.inputs)
+
+
+def _is_last(graph: OnnxGraph, name: str, has_images: bool) -> bool:
+    """Return True if a result has its channels last: it is transposed so, or reshaped in a network
+    with images of channels last, such as by a pixel shuffle.
+    """
+    writer = graph.writers.get(name)
+    while writer is not None and writer.op_type in ON_VALUES:
+        writer = graph.writers.get(writer.source)
+    is_reshaped = writer is not None and writer.op_type == "Reshape" and has_images
+    return writer is not None and (is_reshaped or _is_transpose(writer, TO_LAST))
 
 
 def _images_of_channels_last(graph: OnnxGraph) -> set[str]:
@@ -101,8 +115,8 @@ def moved_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
         for writer in writers
         if writer is not None and _is_transpose(writer, TO_LAST)
     }
-    if _is_one_pixel(graph, node):
-        return _transposed(node, _of_one_pixel(graph, node))
+    if pixel := _of_one_pixel(graph, node):
+        return _transposed(node, pixel)
     is_single = len(node.outputs) == 1 or node.op_type == "Split"
     if not names or sources.keys() != {*names} or not is_single:
         return None
@@ -132,21 +146,18 @@ def _transposed(node: Node, moved: list[Node]) -> list[Node] | None:
     ]
 
 
-def _is_one_pixel(graph: OnnxGraph, node: Node) -> bool:
-    """Return True if a Reshape makes one pixel of channels last, for arithmetic with such maps."""
-    sizes = graph.numbers(node, 1, "") if node.op_type == "Reshape" else []
+def _of_one_pixel(graph: OnnxGraph, node: Node) -> list[Node]:
+    """Return the Reshape to one pixel of channels first, whose values have the same order, for one
+    of channels last that meets such maps; none for other nodes.
+    """
+    sizes = graph.numbers(node, 1, "") if node.op_type == "Reshape" else None
     others = [name for reader in graph.readers[node.result] for name in reader.inputs]
     writers = [graph.writers.get(name) for name in others]
-    return (sizes or [])[1:3] == [1, 1] and any(
-        writer is not None and _is_transpose(writer, TO_LAST) for writer in writers
-    )
-
-
-def _of_one_pixel(graph: OnnxGraph, node: Node) -> list[Node]:
-    """Return the Reshape to one pixel of channels first, whose values have the same order."""
-    batch, *_, channels = graph.numbers(node, 1, "") or ()
-    sizes = graph.add_constant(f"{node.result}.sizes", np.array([batch, channels, 1, 1]), np.int64)
-    return [node.replaced_by("Reshape", [node.source, sizes], **node.attributes)]
+    meets_last = any(writer is not None and _is_transpose(writer, TO_LAST) for writer in writers)
+    if (sizes or [])[1:-1] != [1, 1] or not meets_last:
+        return []
+    name = graph.add_constant(f"{node.result}.sizes", np.array(sizes)[TO_FIRST], np.int64)
+    return [node.replaced_by("Reshape", [node.source, name], **node.attributes)]
 
 
 def multiplied(graph: OnnxGraph, node: Node) -> list[Node] | None:
@@ -157,20 +168,30 @@ def multiplied(graph: OnnxGraph, node: Node) -> list[Node] | None:
         node: any node; the Reshape to a map is replaced.
 
     Returns:
-        The product; None if the node is something else.
+        The product, and the sum with the bias of a Gemm; None if the node is something else.
     """
-    product = graph.writers.get(node.source)
-    if node.op_type != "Reshape" or product is None or product.op_type != "MatMul":
+    product = graph.writers.get(node.source) if node.op_type == "Reshape" else None
+    if product is None or product.op_type not in ("Gemm", "MatMul"):
         return None
     flat = graph.writers.get(product.source)
-    if flat is None or flat.op_type != "Reshape":
+    weight = graph.value(product, 1)
+    if flat is None or flat.op_type != "Reshape" or weight is None:
         return None
     names = flat.source, product.source, node.result
     before, rows, after = (graph.shapes.get(name, ()) for name in names)
     is_map = len(before) == len(after) == 4 and before[:3] == after[:3] and len(rows) == 2
-    if not is_map or before[3] != rows[1]:
+    factors = {product.attributes.get(key, 1) for key in ("alpha", "beta")}
+    if not is_map or before[3] != rows[1] or factors != {1} or product.attributes.get("transA"):
         return None
-    return [node.replaced_by("MatMul", [flat.source, product.inputs[1]])]
+    result = node.result
+    weight = weight.T if product.attributes.get("transB") else weight
+    matrix = graph.add_constant(f"{result}.matrix", weight)
+    if len(product.inputs) == 2:
+        return [node.replaced_by("MatMul", [flat.source, matrix])]
+    return [
+        Node.new("MatMul", [flat.source, matrix], f"{result}.product"),
+        node.replaced_by("Add", [f"{result}.product", product.inputs[2]]),
+    ]
 
 
 def _on_first(graph: OnnxGraph, node: Node, sources: Mapping[str, str], first: str) -> Node | None:

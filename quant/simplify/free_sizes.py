@@ -26,7 +26,7 @@ from onnx import ModelProto
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Rewriting, sizes_of
 from beers_deploy.quant.onnx.image_input import without_size
-from beers_deploy.quant.simplify.channels_first import moved_behind, multiplied
+from beers_deploy.quant.simplify.channels_first import TO_LAST, moved_behind, multiplied
 from beers_deploy.quant.simplify.convolutions import leaves_pads
 from beers_deploy.quant.simplify.fold_affine import affine_chain
 from beers_deploy.quant.simplify.rearrangements import (
@@ -42,8 +42,8 @@ MULTIPLE_PX = 64
 """Six levels of a U-Net halve sides of this length without a remainder."""
 SIZES_PX = (2 * MULTIPLE_PX, 3 * MULTIPLE_PX), (4 * MULTIPLE_PX, 3 * MULTIPLE_PX)
 """Rows and columns differ, so that a network that confuses them is detected."""
-SIZED = {"Concat", "Expand", "MatMul", "Pad", "Resize", "Shape", "Size", "Slice"}
-"""Operators that may need the size of an image, or read a map that is flattened."""
+SIZED = {"Concat", "Expand", "Pad", "Resize", "Shape", "Size", "Slice"}
+"""Operators that may need the size of an image."""
 LOCAL = {
     *("Add", "AveragePool", "Clip", "Concat", "Conv", "ConvTranspose", "DepthToSpace", "Div"),
     *("HardSigmoid", "HardSwish", "LeakyRelu", "MaxPool", "Mul", "Pad", "PRelu", "Relu", "Resize"),
@@ -89,6 +89,7 @@ def free_sizes(model: ModelProto, fold: Fold) -> ModelProto:
         is_rearrangement(graph, node)
         or node.attributes.get("keepdims", 1) == 0
         or leaves_pads(node)
+        or node.attributes.get("perm") == TO_LAST
         or (node.op_type in SIZED and (node.op_type != "Concat" or constants & {*node.inputs}))
         for node in graph.nodes
     ):

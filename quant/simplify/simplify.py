@@ -41,7 +41,15 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import onnxruntime as ort
-from onnx import GraphProto, ModelProto, TensorProto, helper, numpy_helper, version_converter
+from onnx import (
+    GraphProto,
+    ModelProto,
+    TensorProto,
+    defs,
+    helper,
+    numpy_helper,
+    version_converter,
+)
 from onnx.shape_inference import InferenceError
 
 from beers_deploy.profiles.errors import ModelError, reason_of
@@ -326,9 +334,12 @@ def _of_our_opset(model: ModelProto) -> ModelProto:
             attributes = [a for a in node.attribute if a.name not in modes]
             attributes += [helper.make_attribute(*mode) for mode in modes.items()]
             _replace(node.attribute, attributes)
-        # The converter leaves it, though the operator of our opset has no such attribute.
-        if node.op_type == "ReduceMean":
-            _replace(node.attribute, [a for a in node.attribute if "noop" not in a.name])
+        # The converter leaves attributes that the operator of our opset lacks. onnxruntime has
+        # written their defaults.
+        if version > OPSET:
+            newer, ours = (defs.get_schema(node.op_type, v).attributes for v in (version, OPSET))
+            kept = [a for a in node.attribute if a.name in ours or a != newer[a.name].default_value]
+            _replace(node.attribute, kept)
     return converted
 
 

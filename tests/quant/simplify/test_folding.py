@@ -146,6 +146,17 @@ def test_operators_of_other_opsets_become_ours(opset: int) -> None:
     assert all(n.op_type != "Clip" or len(n.input) == 3 for n in short.graph.node)
 
 
+def test_attributes_that_our_opset_lacks_do_not_stop_folding() -> None:
+    """A tool that converts to float16 leaves such a Cast of the result."""
+    model = network_from(
+        f"""f = Cast<to=10>(x) g = Cast<to=1>(f) {CONV}
+        p = MaxPool<kernel_shape=[2,2], strides=[2,2]>(c) s = Shape(f) r = Resize(p, , , s)
+        a = Add(r, g) y = Cast<to=1>(a)""",
+        opset=20,
+    )
+    assert kinds(simplify(model, "a.onnx")) == {"Conv": 1, "MaxPool": 1, "Resize": 1, "Add": 1}
+
+
 def test_an_operator_that_our_opset_lacks_stays_of_its_own() -> None:
     short = simplify(network_from(f"{CONV} n {NORMAL} y = Gelu(n)", 20), "a.onnx")
     assert kinds(short) == {"Conv": 1, "Gelu": 1}

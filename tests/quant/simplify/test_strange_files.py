@@ -13,7 +13,7 @@ from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.quant.onnx_file import load_onnx, read_onnx
 from beers_deploy.quant.session import open_session, tensors_of
 from tests.quant.simplify.networks import CONV, NORMAL, network_from
 
@@ -75,6 +75,33 @@ def test_any_batch_is_read(batch: str | int, tmp_path: Path) -> None:
         tensors_of(open_session(network, 1), None, image)[0] for network in (model, short)
     )
     np.testing.assert_allclose(after, before, rtol=1e-5, atol=1e-5)
+
+
+def test_a_result_may_have_no_sizes(tmp_path: Path) -> None:
+    model = network_from(f"{CONV} y = Relu(c)")
+    model.graph.output[0].type.tensor_type.ClearField("shape")
+    image = np.random.default_rng(1).random((1, 4, 5, 7)).astype(np.float32)
+    networks = model, load_onnx(saved(model, tmp_path))
+    before, after = (tensors_of(open_session(each, 1), None, image)[0] for each in networks)
+    np.testing.assert_array_equal(after, before)
+
+
+def test_check_and_quantize_refuse_a_file_that_cannot_be_simplified(tmp_path: Path) -> None:
+    """onnxruntime runs no two nodes of one name."""
+    model = network_from(f"{CONV} y = Relu(c)", opset=18)
+    for node in model.graph.node:
+        node.name = "node"
+    with pytest.raises(ModelError, match="two nodes with same node name"):
+        load_onnx(saved(model, tmp_path))
+    result = CliRunner().invoke(app, ["check", str(saved(model, tmp_path))])
+    assert (result.exit_code, "same node name" in result.output) == (1, True)
+
+
+def test_an_operator_that_no_opset_has_is_named() -> None:
+    model = network_from(f"{CONV} y = Relu(c)")
+    model.graph.node[1].op_type = "Erfc"
+    with pytest.raises(ModelError, match="Erfc Relu y, but ONNX has no such operator"):
+        read_onnx(model.SerializeToString(), "a.onnx")
 
 
 @pytest.mark.parametrize("path", SMALL, ids=lambda path: path.stem)
