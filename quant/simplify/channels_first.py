@@ -46,13 +46,13 @@ def channels_first(model: ModelProto) -> None:
     ):
         return
     images = _images_of_channels_last(graph)
-    for name in images:
+    for name in sorted(images):
         _read_instead(graph, name, f"{name}.last")
         first = Node.new("Transpose", [name], f"{name}.last", perm=TO_LAST)
         graph.set_nodes([first, *graph.nodes])
     graph.rewrite(moved_behind)
     results = {name for name in graph.outputs if _is_last(graph, name, bool(images))}
-    for name in results:
+    for name in sorted(results):
         _read_instead(graph, name, f"{name}.last")
         graph.rename(name, f"{name}.last")
         first = Node.new("Transpose", [f"{name}.last"], name, f"{name}.first", perm=TO_FIRST)
@@ -80,8 +80,9 @@ def _is_last(graph: OnnxGraph, name: str, has_images: bool) -> bool:
     writer = graph.writers.get(name)
     while writer is not None and writer.op_type in ON_VALUES:
         writer = graph.writers.get(writer.source)
-    is_reshaped = writer is not None and writer.op_type == "Reshape" and has_images
-    return writer is not None and (is_reshaped or _is_transpose(writer, TO_LAST))
+    if writer is None or writer.op_type != "Reshape":
+        return writer is not None and _is_transpose(writer, TO_LAST)
+    return has_images and len(graph.result_sizes[name]) == 4
 
 
 def _images_of_channels_last(graph: OnnxGraph) -> set[str]:

@@ -92,6 +92,22 @@ def test_channels_that_are_last_between_other_layers_become_first(
     assert_allclose(run_model(short, image), before, rtol=1e-4)
 
 
+@pytest.mark.parametrize(("sizes", "shape"), [("rows", (1, 4)), ("blocks", (1, 18, 46, 2))])
+def test_only_a_map_of_channels_last_becomes_one_of_channels_first(
+    sizes: str, shape: tuple[int, ...]
+) -> None:
+    """JAX reshapes the result of a network of channels last, and classifiers theirs."""
+    pool = "p = GlobalAveragePool(t)" if sizes == "rows" else "p = Transpose<perm=[0,2,3,1]>(t)"
+    model = network_from(
+        f"t = Transpose<perm=[0,3,1,2]>(x) {pool} y = Reshape(p, {sizes})",
+        ends=f"float[1,18,23,{CHANNELS}] x => float[{','.join(map(str, shape))}] y",
+        blocks=[1, 18, 46, 2],
+    )
+    before = run_model(model, np.moveaxis(IMAGE, 1, 3))
+    after = run_model(simplify(model, "a.onnx"), IMAGE)
+    assert_allclose(np.moveaxis(after, 1, -1) if len(shape) == 4 else after, before, rtol=1e-5)
+
+
 KERAS = {
     "half of the channels times the other": "s, t = Split<axis=-1>(u) m = Mul(s, t) v = Add(m, t)",
     "a dense layer": """f = Reshape(u, flat) p = MatMul(f, square) s = Shape(u)
