@@ -54,7 +54,7 @@ NUMBERS = {
     "columns": [3],
     "one_three": [1, 3],
     "axes": [2, 3],
-    "one_pixel": [[[[3.0]]]],
+    "pixel": [[[[3.0]]]],
     "copies": [-1, 4, 0, 0],
     "starts": [0, 2, 1, 0],
     "stops": [2**31 - 1, -2, -1, 2**31 - 1],
@@ -207,10 +207,7 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         f"{CONV} k = Max(c, zero) l = Min(six, k) y = {SAME}(l, w)",
         {"Conv": 2, "Clip": 1},
     ),
-    "clipped at the end by the larger and the smaller": (
-        f"{CONV} k = Max(c, half) y = Min(k, one_pixel)",
-        {"Conv": 1, "Clip": 1},
-    ),
+    "clipped at the end": (f"{CONV} k = Max(c, half) y = Min(k, pixel)", {"Conv": 1, "Clip": 1}),
     "scaled behind such a clip": (
         f"{CONV} k = Min(c, three) l = Max(k, half) y = Mul(l, six)",
         {"Conv": 1, "Clip": 1},
@@ -352,11 +349,8 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         y = Mul(r, s)""",
         {"Conv": 2, "Mul": 1, "Relu": 2, "Add": 1},
     ),
-    "a Reshape that copies sides": (
-        f"{CONV} r = Reshape(c, copies) y = {SAME}(r, w)",
-        {"Conv": 2},
-    ),
-    "a crop of rows and columns, whole in other axes": (
+    "a Reshape that copies": (f"{CONV} r = Reshape(c, copies) y = {SAME}(r, w)", {"Conv": 2}),
+    "a crop that names all axes": (
         f"{CONV} s = Slice(c, starts, stops, four_axes) y = Relu(s)",
         {"Conv": 2, "Relu": 1},
     ),
