@@ -12,6 +12,7 @@ the end. Linear layers of torch stand between two such nodes.
 """
 
 from collections.abc import Mapping
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -152,7 +153,8 @@ def _of_one_pixel(graph: OnnxGraph, node: Node) -> list[Node]:
     of channels last that meets such maps; none for other nodes.
     """
     sizes = graph.numbers(node, 1, "") if node.op_type == "Reshape" else None
-    others = [name for reader in graph.readers[node.result] for name in reader.inputs]
+    readers = graph.readers[node.result]
+    others = chain.from_iterable(reader.inputs for reader in readers)
     writers = [graph.writers.get(name) for name in others]
     meets_last = any(writer is not None and _is_transpose(writer, TO_LAST) for writer in writers)
     if (sizes or [])[1:-1] != [1, 1] or not meets_last:

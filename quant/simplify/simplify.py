@@ -338,8 +338,10 @@ def _of_our_opset(model: ModelProto) -> ModelProto:
         # written their defaults.
         if version > OPSET:
             newer, ours = (defs.get_schema(node.op_type, v).attributes for v in (version, OPSET))
-            kept = [a for a in node.attribute if a.name in ours or a != newer[a.name].default_value]
-            _replace(node.attribute, kept)
+            _replace(
+                node.attribute,
+                [a for a in node.attribute if a.name in ours or a != newer[a.name].default_value],
+            )
     return converted
 
 
