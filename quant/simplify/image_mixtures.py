@@ -5,7 +5,8 @@ the image times a matrix. A DPU would store it in 8 bits. The image itself enter
 keep all its bits.
 
 1. A convolution that reads such a mixture reads the image, with the matrix multiplied into its
-   weights. A depthwise one then has one group, so only an image of few channels reaches it.
+   weights. A depthwise one then has one group, which a DPU computes as fast only if the image has
+   few channels, and the kernel few positions.
 2. A Concat of mixtures, such as copies of the image, becomes a convolution of one pixel.
 
 All of it is exact except for the rounding of float32. Zeros of a padding remain zeros, because a
@@ -17,6 +18,7 @@ import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.window import Window
+from beers_deploy.quant.simplify.convolutions import MOST_POSITIONS
 from beers_deploy.quant.simplify.fold_affine import affine_of, is_convolution
 
 PARALLEL_CHANNELS = 16
@@ -71,7 +73,8 @@ class ReadImage:
         if is_one_pixel and (bias is None or not bias.any()):
             self._mixtures[node.result] = weight[:, :, 0, 0]
         outputs, channels = mixture.shape
-        is_slower = (node.groups > 1 or outputs < channels) and channels > PARALLEL_CHANNELS
+        is_large = channels > PARALLEL_CHANNELS or weight[0, 0].size > MOST_POSITIONS
+        is_slower = is_large and (node.groups > 1 or outputs < channels)
         if node.source == self.image or is_slower:
             return None
         name = graph.add_constant(f"{node.name}.of_image", weight)

@@ -52,7 +52,8 @@ def rules_of(nodes: Iterable[PlacedNode]) -> list[str]:
 
 def between_convs(nodes: str, dpu: Dpu = DPU, channels: int = 8) -> list[str]:
     """Return the rules that nodes from `x` to `y` break between two convolutions."""
-    first = f"x = Conv(image, w{channels}x{channels}x1x1)"
+    # One of a single pixel would be folded into the next.
+    first = f"x = {SAME}(image, w{channels}x{channels}x3x3)"
     last = f"p = AveragePool<kernel_shape=[1,1]>(y) z = Conv(p, w1x{channels}x1x1)"
     return broken_rules(written(f"{first} {nodes} {last}", channels, ("z",)), dpu=dpu)
 
