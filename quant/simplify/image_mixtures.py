@@ -67,17 +67,18 @@ class ReadImage:
         mixture = self._mixtures.get(node.source)
         if mixture is None:
             return None
-        weight = _mixed(graph.constants[node.inputs[1]], node.groups, mixture)
+        weight = graph.constants[node.inputs[1]]
         bias = graph.value(node, 2)
         is_one_pixel = node.window(weight.shape[2:]) == ((1, 1), Window())
         if is_one_pixel and (bias is None or not bias.any()):
-            self._mixtures[node.result] = weight[:, :, 0, 0]
+            self._mixtures[node.result] = _mixed(weight, node.groups, mixture)[:, :, 0, 0]
         outputs, channels = mixture.shape
         is_large = channels > PARALLEL_CHANNELS or weight[0, 0].size > MOST_POSITIONS
         is_slower = is_large and (node.groups > 1 or outputs < channels)
         if node.source == self.image or is_slower:
             return None
-        name = graph.add_constant(f"{node.name}.of_image", weight)
+        mixed = _mixed(weight, node.groups, mixture)
+        name = graph.add_constant(f"{node.name}.of_image", mixed)
         attributes = {**node.attributes, "group": 1}
         return [node.replaced_by("Conv", [self.image, name, *node.inputs[2:]], **attributes)]
 
@@ -112,6 +113,7 @@ def _mixed(weight: np.ndarray, groups: int, mixture: np.ndarray) -> np.ndarray:
         mixture: (M, C) the matrix of the mixture.
     """
     by_group = weight.astype(np.float64).reshape(groups, -1, *weight.shape[1:])
-    mixtures = mixture.reshape(groups, -1, mixture.shape[1])
-    mixed: np.ndarray = np.einsum("gomrc,gmi->goirc", by_group, mixtures)
+    by_group = np.moveaxis(by_group, 2, -1)
+    mixed = by_group @ mixture.reshape(groups, 1, 1, -1, mixture.shape[1])
+    mixed = np.moveaxis(mixed, -1, 2)
     return mixed.reshape(-1, *mixed.shape[2:])

@@ -296,6 +296,19 @@ def test_each_step_is_named(float_onnx: onnx.ModelProto, patches: Patches) -> No
     assert [*named] == ["scale", "float", "equalising", "first", "tensors"]
 
 
+def test_tensors_next_to_a_group_are_equalised_only_if_that_is_clearly_better(
+    float_onnx: onnx.ModelProto, patches: Patches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """ConvBEERS gains next to nothing from it."""
+    results = []
+    for share in (0.85, 0.0, 10.0):
+        monkeypatch.setattr("beers_deploy.quant.plan.CLEARLY_LESS", share)
+        results.append(run_model(quickly(float_onnx, patches).host, image(23, 31)))
+    usual, never, always = results
+    assert_array_equal(usual, never)
+    assert (usual != always).any()
+
+
 def one_scale() -> AbstractContextManager[object]:
     """Force one scale for each residual group, even if separate scales err less."""
     return patch.object(CropTrials, "error", return_value=0.0)
