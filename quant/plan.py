@@ -250,7 +250,7 @@ def _equalized_groups(
 
 
 def _equalized_singles(
-    graph: Graph, plan: Plan, trials: Trials, images: Sequence[np.ndarray], most_groups: int
+    graph: Graph, plan: Plan, trials: CropTrials, images: Sequence[np.ndarray], most_groups: int
 ) -> Graph:
     """Equalise the single tensors.
 

@@ -114,6 +114,5 @@ def _mixed(weight: np.ndarray, groups: int, mixture: np.ndarray) -> np.ndarray:
     """
     by_group = weight.astype(np.float64).reshape(groups, -1, *weight.shape[1:])
     by_group = np.moveaxis(by_group, 2, -1)
-    mixed = by_group @ mixture.reshape(groups, 1, 1, -1, mixture.shape[1])
-    mixed = np.moveaxis(mixed, -1, 2)
-    return mixed.reshape(-1, *mixed.shape[2:])
+    mixed = np.moveaxis(by_group @ mixture.reshape(groups, 1, 1, -1, mixture.shape[1]), -1, 2)
+    return np.asarray(mixed.reshape(-1, *mixed.shape[2:]))
