@@ -307,7 +307,8 @@ def _cut(
             )
         yield image[None], reference[None]
         return
-    side = fixed_px or PATCH_PX // multiple_px * multiple_px
+    # Sides of a strongly strided network may have to be multiples of more than PATCH_PX.
+    side = fixed_px or max(PATCH_PX // multiple_px, 1) * multiple_px
     # An image smaller than a patch is one patch, cut to the sides that the network takes.
     rows, columns = (side if n >= side else n // multiple_px * multiple_px for n in image.shape[1:])
     for top in range(0, height - rows + 1, rows):

@@ -38,6 +38,9 @@ def test_samples_are_cut_to_patches_of_aligned_sides(tmp_path: Path) -> None:
     assert small.degraded[0].shape == (1, 2, 48, 36)
     tiles = read_samples(large_path, 2, 32).all
     assert len(tiles.pairs) == 3 * 4 * 4
+    # A side must be a multiple of 136 pixels, so that no patch of 128 fits the network.
+    strided = read_samples(large_path, 2, None, 136).all
+    assert [image.shape for image in strided.degraded] == [(1, 2, 136, 136)] * 3
 
 
 def test_references_stay_with_their_images(tmp_path: Path) -> None:
