@@ -14,7 +14,7 @@ import onnx
 from onnx import AttributeProto, ModelProto, NodeProto, helper, shape_inference
 
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.quant.domains import opset_of
+from beers_deploy.quant.domains import STANDARD, opset_of
 
 WINDOW_DEFAULTS = {
     "strides": [1, 1],
@@ -108,11 +108,11 @@ def _defaults(node: NodeProto, opset: int) -> Iterator[AttributeProto]:
     """Yield the attributes that a node leaves to their defaults.
 
     Args:
-        node: any node. One that ONNX does not define has no known defaults.
+        node: any node. One that is no operator of ONNX itself has no known defaults.
         opset: the opset of the model, because defaults depend on it.
     """
     stated = {attribute.name for attribute in node.attribute}
-    if not onnx.defs.has(node.op_type, node.domain):
+    if node.domain not in STANDARD or not onnx.defs.has(node.op_type):
         return
     for name, attribute in onnx.defs.get_schema(node.op_type, opset).attributes.items():
         if name in stated:
