@@ -42,6 +42,9 @@ SIDE_PX = 7
 that the window of a DPU accepts.
 """
 
+IDENTITY = np.pad([[1.0]], SIDE_PX // 2)
+"""The kernel that leaves an image as it is."""
+
 GRID = 64
 """The number of frequencies along an axis. A finer grid changes no tap by more than 3e-4 of the
 largest tap.
@@ -104,8 +107,6 @@ class Bank:
         numbers of 12 bits. The gain is sigma / SIGMA within GAINS, rounded to eighths, so that the
         single weight of the image is an integer: no duplicated channel corrects its rounding.
         """
-        # In eighths, the single weight of the image is an integer in INT8. No copy would correct
-        # its rounding.
         return float(np.clip(np.rint(8 * self.sigma / SIGMA) / 8, *GAINS))
 
     def reach(self, kernels: Kernels) -> tuple[float, float]:
@@ -140,9 +141,7 @@ class Bank:
         """All kernels that a network applies to the image: the identity and `filters`, shape (6, 7,
         7).
         """
-        itself = np.zeros((1, SIDE_PX, SIDE_PX))
-        itself[0, SIDE_PX // 2, SIDE_PX // 2] = 1
-        return np.concatenate([itself, self.filters])
+        return np.concatenate([IDENTITY[None], self.filters])
 
     @property
     def unit(self) -> float:
@@ -196,9 +195,7 @@ def _bank(sensor: Instrument, sigma: float, kernels: Kernels) -> Bank:
         fitted_kernel(gain, np.abs(blur) ** 2 + epsilon * r_squared, r_squared)
         for gain, epsilon in zip(gains, epsilons, strict=True)
     ]
-    itself = np.zeros((SIDE_PX, SIDE_PX))
-    itself[SIDE_PX // 2, SIDE_PX // 2] = 1
-    falling = np.stack([*wiener_kernels, itself])
+    falling = np.stack([*wiener_kernels, IDENTITY])
     return Bank(falling[:-1] - falling[1:], sigma)
 
 

@@ -25,6 +25,7 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.integer.arithmetic import (
     LEAKY_OF_256,
+    accumulator_bias,
     activated,
     activation_table,
     bilinear_weights,
@@ -57,6 +58,8 @@ class LayerWriter:
         constant_bytes: the size of all weights, biases and tables.
         line_length: the number of values that the buffer `line` of `kernels/convolve.c` needs.
         weights_length: the number of values that the buffer `weights` there needs.
+        number: the place of the operation that is being written. It ends the names of its
+            constants, which are then unique.
     """
 
     def __init__(self, core: IntCore, shapes: Mapping[str, Shape]) -> None:
@@ -75,13 +78,13 @@ class LayerWriter:
         self.constant_bytes = 0
         self.line_length = 0
         self.weights_length = 0
+        self.number = 0
 
     def write(self, number: int, op: IntConv | Op) -> None:
         """Write an operation in C: add its constants, and the call that computes it.
 
         Args:
-            number: the place of the operation in the core, from 1 on. It makes the names in C
-                unique.
+            number: the place of the operation in the core, from 1 on.
             op: the operation.
 
         Raises:
@@ -107,16 +110,18 @@ class LayerWriter:
                 f"Reads {' and '.join(tensors[:-1])}, writes {tensors[-1]}."
             )
         )
-        _WRITERS[type(op)](self, op, f"_{number}")
+        self.number = number
+        _WRITERS[type(op)](self, op)
 
-    def array(self, kind: type[np.int8 | np.int32], name: str, values: np.ndarray) -> str:
-        """Add the definition of a constant array, and return its name.
+    def array(self, kind: type[np.int8 | np.int32], role: str, values: np.ndarray) -> str:
+        """Add the definition of a constant array of a layer, and return its name.
 
         Args:
             kind: the type of the numbers.
-            name: the name of the array in C, which must be unique in the file.
+            role: the use of the array, such as "weight", with which its name begins.
             values: integers of any shape, stored flat in C order.
         """
+        name = f"{role}_{self.number}"
         self.constant_bytes += values.size * np.dtype(kind).itemsize
         numbers = fill(
             ", ".join(map(str, values.ravel().tolist())),
@@ -129,18 +134,18 @@ class LayerWriter:
         )
         return name
 
-    def struct(self, kind: str, name: str, **fields: str | int) -> str:
+    def struct(self, kind: str, **fields: str | int) -> str:
         """Define a constant struct with the parameters of a layer.
 
         Args:
             kind: the struct's type, as a kernel declares it.
-            name: the name of the constant.
             fields: the initializer of each field in C.
 
         Returns:
             The C expression of a pointer to the struct.
         """
         lines = "".join(f"    .{key} = {value},\n" for key, value in fields.items())
+        name = f"layer_{self.number}"
         self.constants.append(f"static const struct {kind} {name} = {{\n{lines}}};")
         return f"&{name}"
 
@@ -232,7 +237,7 @@ def _axes(window: Window, kernel: tuple[int, ...]) -> dict[str, str]:
     return {"rows": rows, "columns": columns}
 
 
-def _conv(w: LayerWriter, op: IntConv, number: str) -> None:
+def _conv(w: LayerWriter, op: IntConv) -> None:
     """Write a convolution, and make the buffers `line` and `weights` long enough for it."""
     window = op.window
     weight = op.weight
@@ -245,22 +250,18 @@ def _conv(w: LayerWriter, op: IntConv, number: str) -> None:
         rows, columns = (side - 1 for side in weight.shape[2:])
         window = Window(pads=(rows - window.pads[0], columns - window.pads[1], 0, 0))
     product = op.weight_frac_bits + w.core.frac_bits[op.input]
-    shift = product - op.bias_frac_bits
-    bias = op.bias.astype(np.int64)
-    # Sums start at the bias, so it must have their unit. A bias that is finer loses its lowest
-    # bits.
-    bias = bias << shift if shift >= 0 else bias >> -shift
+    # Sums start at the bias, so it must have their unit.
+    bias = accumulator_bias(op, product - op.bias_frac_bits)
     cut = product - w.core.frac_bits[op.output]
     layer = w.struct(
         "convolution",
-        f"layer{number}",
         **_axes(window, weight.shape[2:]),
         groups=op.groups,
         spread=spread,
         # The kernel reads column by column, then rows, then channels, which lie side by side in a
         # map.
-        weight=w.array(np.int8, f"weight{number}", weight.transpose(0, 3, 2, 1)),
-        bias=w.array(np.int32, f"bias{number}", bias),
+        weight=w.array(np.int8, "weight", weight.transpose(0, 3, 2, 1)),
+        bias=w.array(np.int32, "bias", bias),
         rounding=w.rounding(op, cut, bound_of(op, bias), op.activation, product),
     )
     w.call("convolve", layer, op)
@@ -276,7 +277,7 @@ def _conv(w: LayerWriter, op: IntConv, number: str) -> None:
     w.weights_length = max(w.weights_length, channels * run)
 
 
-def _add(w: LayerWriter, op: Add, number: str) -> None:
+def _add(w: LayerWriter, op: Add) -> None:
     """Write an addition: both inputs are shifted left to the finest scale and summed there."""
     bits = [w.core.frac_bits[name] for name in op.inputs]
     finest = max(bits)
@@ -286,20 +287,21 @@ def _add(w: LayerWriter, op: Add, number: str) -> None:
     # An int8 value is at most 128 in size.
     largest = float(np.log2(128 * (first + second)))
     rounding = w.rounding(op, shift, largest, op.activation, finest)
-    layer = w.struct("addition", f"layer{number}", first=first, second=second, rounding=rounding)
+    layer = w.struct("addition", first=first, second=second, rounding=rounding)
     w.call("add", layer, op)
 
 
-def _mul(w: LayerWriter, op: Mul, number: str) -> None:
+def _mul(w: LayerWriter, op: Mul) -> None:
     """Write a product of two tensors, whose fractional bits add up."""
     shift = sum(w.core.frac_bits[name] for name in op.inputs) - w.core.frac_bits[op.output]
     # The largest product is that of -128 and -128.
     rounding = w.rounding(op, shift, 14.0)
-    w.constants.append(f"static const struct rounding layer{number} = {rounding};")
-    w.call("multiply", f"&layer{number}", op)
+    name = f"layer_{w.number}"
+    w.constants.append(f"static const struct rounding {name} = {rounding};")
+    w.call("multiply", f"&{name}", op)
 
 
-def _concat(w: LayerWriter, op: Concat, number: str) -> None:  # noqa: ARG001 - of other layers
+def _concat(w: LayerWriter, op: Concat) -> None:
     """Write a call for each input, which copies it behind the channels of the inputs before it."""
     w.kernels.add("concatenate")
     first = 0
@@ -308,13 +310,13 @@ def _concat(w: LayerWriter, op: Concat, number: str) -> None:  # noqa: ARG001 - 
         first += w.shapes[name][0]
 
 
-def _max_pool(w: LayerWriter, op: MaxPool, number: str) -> None:
+def _max_pool(w: LayerWriter, op: MaxPool) -> None:
     """Write a maximum over windows, which needs no rounding."""
-    layer = w.struct("max_pool", f"layer{number}", **_axes(op.window, op.kernel))
+    layer = w.struct("max_pool", **_axes(op.window, op.kernel))
     w.call("pool_maxima", layer, op)
 
 
-def _average_pool(w: LayerWriter, op: AveragePool, number: str) -> None:
+def _average_pool(w: LayerWriter, op: AveragePool) -> None:
     """Write a mean over windows as the window's sum times an integer factor and a right shift."""
     assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
     factor, shift = mean_factor(op.kernel)
@@ -322,7 +324,6 @@ def _average_pool(w: LayerWriter, op: AveragePool, number: str) -> None:
     largest = float(np.log2(128 * factor * op.kernel[0] * op.kernel[1]))
     layer = w.struct(
         "average_pool",
-        f"layer{number}",
         **_axes(op.window, op.kernel),
         factor=factor,
         rounding=w.rounding(op, shift, largest),
@@ -330,7 +331,7 @@ def _average_pool(w: LayerWriter, op: AveragePool, number: str) -> None:
     w.call("pool_means", layer, op)
 
 
-def _resize(w: LayerWriter, op: Resize, number: str) -> None:
+def _resize(w: LayerWriter, op: Resize) -> None:
     """Write an enlargement, which repeats pixels or interpolates them by integer weights."""
     if not op.bilinear:
         w.call("repeat", op.factor, op)
@@ -338,25 +339,24 @@ def _resize(w: LayerWriter, op: Resize, number: str) -> None:
     weight, shift = bilinear_weights(op.factor)
     layer = w.struct(
         "interpolation",
-        f"layer{number}",
         factor=op.factor,
-        weight=w.array(np.int8, f"weight{number}", weight),
+        weight=w.array(np.int8, "weight", weight),
         # The weights of a place sum to 2^shift.
         rounding=w.rounding(op, shift, 7.0 + shift),
     )
     w.call("interpolate", layer, op)
 
 
-def _shuffle(w: LayerWriter, op: Shuffle, number: str) -> None:
+def _shuffle(w: LayerWriter, op: Shuffle) -> None:
     """Write a pixel shuffle or its inverse, which moves values only."""
-    layer = w.struct("shuffle", f"layer{number}", block=op.block, by_channel=int(op.columns_first))
+    layer = w.struct("shuffle", block=op.block, by_channel=int(op.columns_first))
     w.kernels.add("shuffle")
     w.call("to_pixels" if op.up else "to_channels", layer, op)
 
 
-def _pointwise(w: LayerWriter, op: Pointwise, number: str) -> None:
+def _pointwise(w: LayerWriter, op: Pointwise) -> None:
     """Write an activation as a table of all 256 int8 values."""
-    table = w.array(np.int8, f"table{number}", activation_table(op, w.core.frac_bits))
+    table = w.array(np.int8, "table", activation_table(op, w.core.frac_bits))
     w.call("look_up", table, op)
 
 

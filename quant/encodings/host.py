@@ -12,7 +12,7 @@ as a fault.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import chain
 from typing import Any
@@ -47,6 +47,7 @@ from beers_deploy.quant.graph.base import THE_IMAGE
 from beers_deploy.quant.graph.writer import window_attributes, write_float, write_shuffle
 from beers_deploy.quant.host_part import ZERO, HostWriter
 from beers_deploy.quant.integer.arithmetic import (
+    accumulator_bias,
     activation_table,
     bilinear_weights,
     mean_factor,
@@ -145,29 +146,29 @@ def _conv(w: HostWriter, core: IntCore, op: IntConv) -> None:
     elif op.activation is Activation.leaky_relu:
         _leaky(w, core, op)
     else:
-        _qlinear(w, core, op, _bias(core, op))
+        _qlinear(w, core.frac_bits, op, _bias(core, op))
 
 
 def _bias(core: IntCore, op: IntConv) -> np.ndarray:
     """Return the bias at the accumulator's scale, (O,) int32."""
     shift = op.weight_frac_bits + core.frac_bits[op.input] - op.bias_frac_bits
-    return op.bias.astype(np.int32) << shift
+    return accumulator_bias(op, shift).astype(np.int32)
 
 
-def _qlinear(w: HostWriter, core: IntCore, op: IntConv, bias: np.ndarray) -> None:
-    feeds = [op.input, w.unit(core.frac_bits[op.input]), w.zero_point()]
-    feeds += [
+def _qlinear(w: HostWriter, frac_bits: Mapping[str, int], op: IntConv, bias: np.ndarray) -> None:
+    feeds = [
+        op.input,
+        w.unit(frac_bits[op.input]),
+        w.zero_point(),
         w.constant(f"{op.name}.weight", op.weight),
         w.unit(op.weight_frac_bits),
         _weight_zero(w, op.name),
-    ]
-    feeds += [
-        w.unit(core.frac_bits[op.output]),
+        w.unit(frac_bits[op.output]),
         w.zero_point(),
         w.constant(f"{op.name}.bias", bias),
     ]
     w.node("QLinearConv", _unclamped(op), feeds, name=op.name, **_attributes(op))
-    _clamp(w, core, op)
+    _clamp(w, frac_bits, op)
 
 
 def _weight_zero(w: HostWriter, name: str) -> str:
@@ -188,14 +189,14 @@ def _unclamped(op: IntConv | Add) -> str:
     return op.output if op.activation is Activation.none else f"{op.output}.linear"
 
 
-def _clamp(w: HostWriter, core: IntCore, op: IntConv | Add) -> None:
+def _clamp(w: HostWriter, frac_bits: Mapping[str, int], op: IntConv | Add) -> None:
     """Write ReLU or ReLU6 on a rounded result, which they only clip."""
     if op.activation is Activation.none:
         return
     relu = op.output if op.activation is Activation.relu else f"{op.output}.above_0"
     w.node("Max", relu, [_unclamped(op), w.zero_point()], name=f"{op.name}.relu")
     if op.activation is Activation.relu6:
-        units = ZERO + six_in_units(core.frac_bits[op.output])
+        units = ZERO + six_in_units(frac_bits[op.output])
         six = w.constant(f"{op.name}.six", np.array(units, np.uint8))
         w.node("Min", op.output, [relu, six], name=f"{op.name}.relu6")
 
@@ -240,10 +241,8 @@ def _transposed(w: HostWriter, core: IntCore, op: IntConv) -> None:
     phased = replace(
         op, output=f"{op.output}.phases", weight=weight, window=Window(pads=(reach,) * 4)
     )
-    phased_core = replace(
-        core, frac_bits={**core.frac_bits, phased.output: core.frac_bits[op.output]}
-    )
-    _qlinear(w, phased_core, phased, np.tile(_bias(core, op), stride**2))
+    frac_bits = {**core.frac_bits, phased.output: core.frac_bits[op.output]}
+    _qlinear(w, frac_bits, phased, np.tile(_bias(core, op), stride**2))
     shuffle = Shuffle(
         f"{op.name}.shuffle", phased.output, f"{op.output}.whole", stride, True, False
     )
@@ -269,7 +268,7 @@ def _add(w: HostWriter, core: IntCore, op: Add | Mul) -> None:
     result = _unclamped(op) if isinstance(op, Add) else op.output
     w.node(f"QLinear{type(op).__name__}", result, feeds, name=op.name, domain=MICROSOFT)
     if isinstance(op, Add):
-        _clamp(w, core, op)
+        _clamp(w, core.frac_bits, op)
 
 
 def _average_pool(w: HostWriter, core: IntCore, op: AveragePool) -> None:

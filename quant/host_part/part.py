@@ -138,8 +138,9 @@ class HostPart(HostSteps):
             image = np.pad(image, ((0, 0), (0, 0), *[(self.border_px,) * 2] * 2), "reflect")
         for shuffle in self.front:
             image = shuffle(image)
-        if self.full_scale is not None:
-            image = image * (1 / self.full_scale)[:, None, None]
+        full_scale = self.full_scale
+        if full_scale is not None:
+            image = image * (1 / full_scale)[:, None, None]
         return self.encoding.encode(image)
 
     def decode(self, result: np.ndarray, scale: float) -> np.ndarray:
@@ -260,8 +261,9 @@ class HostPart(HostSteps):
             write_shuffle(w, shuffle, image, f"host_front.shuffled_{k}", channels)
             image = f"host_front.shuffled_{k}"
             channels = channels * shuffle.block**2
-        if self.full_scale is not None:
-            factors = w.constant("input_factors", (1 / self.full_scale)[None, :, None, None])
+        full_scale = self.full_scale
+        if full_scale is not None:
+            factors = w.constant("input_factors", (1 / full_scale)[None, :, None, None])
             image = w.node("Mul", "host_front.shares", [image, factors])
         self.encoding.write(w, image)
         # The planes are int8 values stored as uint8 with the zero point ZERO.

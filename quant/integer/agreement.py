@@ -74,8 +74,9 @@ def agreement(core: IntCore, host: ModelProto, image: np.ndarray) -> Agreement:
     names = [op.output for op in core.ops]
     session = open_session(with_outputs(any_size(host), dict.fromkeys(names, TensorProto.UINT8)))
     stored = session.run(names, {session.get_inputs()[0].name: image})
-    up, reports = run_core(core, core.host_part.encode(image))
-    even, _ = run_core(core, core.host_part.encode(image), half_even=True)
+    planes = core.host_part.encode(image)
+    up, reports = run_core(core, planes)
+    even, _ = run_core(core, planes, half_even=True)
     layers = []
     for name, report, runtime in zip(names, reports, stored, strict=True):
         difference = np.abs(up[name] - even[name])

@@ -92,6 +92,19 @@ def _products(windows: np.ndarray, weight: np.ndarray, groups: int) -> np.ndarra
     return sums
 
 
+def accumulator_bias(op: IntConv, shift: int) -> np.ndarray:
+    """Return the bias of a convolution at the scale of its sums, (O,) int64.
+
+    A bias finer than the accumulator, which a board's rules allow, loses its lowest bits.
+
+    Args:
+        op: the convolution.
+        shift: the left shift in bits from the bias's own scale; a negative one shifts right.
+    """
+    bias = op.bias.astype(np.int64)
+    return bias << shift if shift >= 0 else bias >> -shift
+
+
 def bound_of(op: IntConv, bias: np.ndarray) -> float:
     """Return the number of bits, without the sign, that no sum of a convolution exceeds, for any
     int8 image.

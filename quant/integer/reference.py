@@ -31,6 +31,7 @@ from beers_deploy.quant.graph import (
     Shuffle,
 )
 from beers_deploy.quant.integer.arithmetic import (
+    accumulator_bias,
     activated,
     activation_table,
     bound_of,
@@ -64,17 +65,6 @@ class Faults:
 
     shifts: Mapping[tuple[str, str], int] = field(default_factory=dict)
     touch: Callable[[str, np.ndarray], np.ndarray] = field(default=lambda _, tensor: tensor)
-
-    def shift(self, op: str, name: str, meant: int) -> int:
-        """Return the shift in bits that an operation uses: the injected one, or `meant` if there is
-        no fault.
-
-        Args:
-            op: the name of the operation.
-            name: the name of the shift, such as "shift_cut".
-            meant: the right shift.
-        """
-        return self.shifts.get((op, name), meant)
 
 
 NO_FAULTS = Faults()
@@ -133,22 +123,6 @@ def run_core(
     return tensors, reports
 
 
-def correction(core: IntCore, planes: np.ndarray, half_even: bool = False) -> np.ndarray:
-    """Run an integer core, and return its result in real values, with all copies of each channel.
-
-    Args:
-        core: the integer core.
-        planes: (N, P, H, W) int8, as `HostPart.encode` returns them.
-        half_even: True rounds ties to even, as onnxruntime does; False rounds them up, as the DPU
-            does.
-
-    Returns:
-        (N, copies C, H, W) float32, multiples of the result's scale.
-    """
-    tensors, _ = run_core(core, planes, half_even)
-    return np.asarray(tensors[CORRECTION] * np.float32(core.scale(CORRECTION)), np.float32)
-
-
 def merged_correction(core: IntCore, tensors: Mapping[str, np.ndarray]) -> np.ndarray:
     """Decode the result in a core's tensors as the host does, with one value for the copies of each
     channel.
@@ -161,9 +135,7 @@ def merged_correction(core: IntCore, tensors: Mapping[str, np.ndarray]) -> np.nd
         (N, C, H, W) float32, as `HostPart.decode` returns it.
     """
     scale = core.scale(CORRECTION)
-    return core.host_part.decode(
-        (tensors[CORRECTION] * np.float32(scale)).astype(np.float32), scale
-    )
+    return core.host_part.decode(tensors[CORRECTION] * np.float32(scale), scale)
 
 
 Sums = tuple[np.ndarray, int, float, int]
@@ -227,14 +199,12 @@ def _moving(core: IntCore, op: Op, inputs: list[np.ndarray]) -> np.ndarray:
 
 def _conv(core: IntCore, op: IntConv, image: np.ndarray, faults: Faults) -> Sums:
     product = op.weight_frac_bits + core.frac_bits[op.input]
-    shift = faults.shift(op.name, "shift_bias", product - op.bias_frac_bits)
-    bias = op.bias.astype(np.int64)
-    # A bias finer than the accumulator, which a board's rules allow, loses its lowest bits.
-    bias = bias << shift if shift >= 0 else bias >> -shift
+    shift = faults.shifts.get((op.name, "shift_bias"), product - op.bias_frac_bits)
+    bias = accumulator_bias(op, shift)
     sums = convolve(image, op.weight, op.window, op.groups, op.transposed) + bias[:, None, None]
     # The DPU applies the activation to the accumulator, before the one rounding.
     sums, finer = activated(sums, op.activation, product)
-    cut = faults.shift(op.name, "shift_cut", product - core.frac_bits[op.output])
+    cut = faults.shifts.get((op.name, "shift_cut"), product - core.frac_bits[op.output])
     return sums, cut + finer, bound_of(op, bias), finer
 
 
@@ -250,7 +220,7 @@ def _add(core: IntCore, op: Add, inputs: list[np.ndarray], faults: Faults) -> Su
     # An int8 value is at most 128 in size.
     bound = sum(128 << shift for shift in shifts)
     coarsest = min(core.frac_bits[name] for name in op.inputs)
-    write = faults.shift(op.name, "shift_write", coarsest - core.frac_bits[op.output])
+    write = faults.shifts.get((op.name, "shift_write"), coarsest - core.frac_bits[op.output])
     return sums, finest - coarsest + write + finer, float(np.log2(bound)), finer
 
 

@@ -99,11 +99,9 @@ class TrainableCore(torch.nn.Module):
 
     def core(self) -> IntCore:
         """Return an integer core with the trained weights and biases, rounded to int8."""
-        weights = map(_whole, self.weights)
-        biases = map(_whole, self.biases)
         trained = {
-            op.name: replace(op, weight=weight, bias=bias)
-            for op, weight, bias in zip(self._convs, weights, biases, strict=True)
+            op.name: replace(op, weight=_whole(weight), bias=_whole(bias))
+            for op, weight, bias in zip(self._convs, self.weights, self.biases, strict=True)
         }
         ops = [trained.get(op.name, op) for op in self._core.ops]
         host_part = self._core.host_part

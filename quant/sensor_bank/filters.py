@@ -131,40 +131,36 @@ def integer_bank(bank: Bank, scale: int, gain: float, kernels: Kernels = "fitted
     exact = steps * 2.0**frac_bits
     residual = np.zeros_like(exact)
     weights = []
+    outputs = channels(kernels)
     # Each further copy of a kernel makes up for the rounding errors of those before it.
-    for kernel, _ in channels(kernels):
+    for kernel, _ in outputs:
+        values = (exact[kernel] + residual[kernel]).ravel()
+        # The image comes in its own steps, and from the coarse planes only.
+        coarse = np.rint(STEP_DN * values).astype(np.int64)
+        whole = parts = np.zeros_like(coarse)
         if kernel:
-            values = (exact[kernel] + residual[kernel]).ravel()
             coarse = shaped(STEP_DN * values)
             # The last plane holds half of the remainder, so this grid is twice as fine.
             fine = shaped(PART * values)
             # Their sum is 0, so the number of odd weights is even.
             odd = np.flatnonzero(fine % PART)
-            parts = np.zeros_like(fine)
             # One up, one down: the weights of each plane sum to 0, and flat ground gives 0.
             parts[odd[::2]] = 1
             parts[odd[1::2]] = -1
-            weight = np.stack([*_halves(coarse), (fine - parts) // PART, parts])
-            weight = weight.reshape(BANK_SLICES.planes, *exact[kernel].shape)
-        else:
-            # The image comes in its own steps, and from the coarse planes only.
-            none = np.zeros(exact[0].shape, np.int64)
-            weight = np.stack([*_halves(np.rint(STEP_DN * exact[0]).astype(np.int64)), none, none])
+            whole = (fine - parts) // PART
+        # The coarse plane comes twice, so a weight of twice int8's size fits.
+        half = coarse // 2
+        weight = np.stack([half, coarse - half, whole, parts])
+        weight = weight.reshape(BANK_SLICES.planes, *exact[kernel].shape)
         weights.append(weight)
         # The two coarse planes carry nearly all of a number; the others only the remainder.
         residual[kernel] += exact[kernel] - (weight[0] + weight[1]) / STEP_DN
     by_plane = np.stack(weights).astype(np.float64)
     planes = [in_places(by_plane[:, plane], scale) for plane in range(BANK_SLICES.planes)]
-    offsets = [offset for _, offset in channels(kernels)]
+    offsets = [offset for _, offset in outputs]
     return IntegerBank(
         np.concatenate(planes, 1).astype(np.int8), frac_bits, np.repeat(offsets, scale**2)
     )
-
-
-def _halves(weight: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return two integers of each weight, which add up to it."""
-    # The coarse plane comes twice, so a weight of twice int8's size fits.
-    return weight // 2, weight - weight // 2
 
 
 def shaped(values: Array) -> NDArray[np.int64]:

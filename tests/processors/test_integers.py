@@ -15,7 +15,7 @@ from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
 from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, Activation, same
 from beers_deploy.quant.host_part import IMAGE_SLICES
 from beers_deploy.quant.integer.agreement import agreement
-from beers_deploy.quant.integer.reference import correction, merged_correction, run_core
+from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.session import open_session, run
 from tests.processors.conftest import Encodings
 
@@ -51,7 +51,8 @@ def test_both_encodings_equal_the_integer_reference(
     assert_array_equal(run(open_session(shipped.host, optimise=optimise), pixels), restored)
     feed = {PLANES: planes.astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
     by_board = open_session(shipped.board, optimise=optimise).run(None, feed)[0]
-    assert_array_equal(by_board, correction(shipped.core, planes, half_even=True))
+    scale = np.float32(shipped.core.scale(CORRECTION))
+    assert_array_equal(by_board, tensors[CORRECTION] * scale)
 
 
 def test_every_layer_equals_the_integer_reference(shipped: Encodings) -> None:
@@ -95,7 +96,8 @@ def harsh_core(seed: int, channels: int) -> IntCore:
 def test_the_largest_products_are_added_exactly(seed: int, channels: int) -> None:
     core = harsh_core(seed, channels)
     pixels = image(edges, (13, 21), seed)
-    expected = correction(core, IMAGE_SLICES.encode(pixels), half_even=True)
+    tensors, _ = run_core(core, IMAGE_SLICES.encode(pixels), half_even=True)
+    expected = merged_correction(core, tensors)
     assert len(np.unique(expected)) > 40
     restored = np.clip(pixels + expected, 0, 1)
     feed = {

@@ -15,7 +15,7 @@ from beers_deploy.quant import graph as ops
 from beers_deploy.quant.core import build_core
 from beers_deploy.quant.encodings import host_model, vint8_model
 from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, Activation, Graph, Window
-from beers_deploy.quant.integer.reference import correction
+from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.onnx.graph import constants
 from beers_deploy.quant.session import open_session, planes_of, run
 from tests.quant.quick import uniform
@@ -81,10 +81,10 @@ def test_it_computes_the_bits_of_the_host_file(
     image = uniform(1, 1, tile_px, tile_px, seed=seed)
     model = vint8_model(core, {}, tile_px)
     host = host_model(core, {})
+    tensors, _ = run_core(core, core.host_part.encode(image), half_even=True)
     for optimise in (True, False):
         result = open_session(model, optimise=optimise).run(None, {PLANES: planes_of(image)})[0]
-        expected = correction(core, core.host_part.encode(image), half_even=True)
-        assert_array_equal(result, expected)
+        assert_array_equal(result, merged_correction(core, tensors))
         by_host = run(open_session(host, optimise=optimise), image)
         assert_array_equal(core.host_part.finish(image, result), by_host)
 

@@ -17,7 +17,7 @@ from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import board_model, host_model
 from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS
 from beers_deploy.quant.host_part import IMAGE_SLICES, DualRange
-from beers_deploy.quant.integer.reference import correction
+from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.studies.stress.faults import with_ops
@@ -80,8 +80,10 @@ def test_both_files_hold_every_bias_at_its_scale(
     core = biased(quantized.core, generator)
     image = generator.uniform(0.3, 0.7, (1, 1, *shape)).astype(np.float32)
     planes = IMAGE_SLICES.encode(image)
-    expected = correction(core, planes, half_even=True)
-    restored = np.clip(image + DualRange().decode(expected, core.scale(CORRECTION)), 0, 1)
+    scale = core.scale(CORRECTION)
+    tensors, _ = run_core(core, planes, half_even=True)
+    expected = tensors[CORRECTION] * np.float32(scale)
+    restored = np.clip(image + DualRange().decode(expected, scale), 0, 1)
     assert_array_equal(run(open_session(host_model(core, {})), image), restored)
     feed = {PLANES: planes.astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
     assert_array_equal(open_session(board_model(core, {})).run(None, feed)[0], expected)
