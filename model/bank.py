@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beers_deploy.model.family import RANGES, noise_over_full_scale
-from beers_deploy.model.simulator.mtf import sensor_mtf
+from beers_deploy.model.simulator.mtf import frequency_grid, sensor_mtf
 from beers_deploy.model.variants import Kernels
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import NYQUIST, Array
@@ -179,8 +179,7 @@ def _reference() -> Instrument:
 
 
 def _bank(sensor: Instrument, sigma: float, kernels: Kernels) -> Bank:
-    fy = np.fft.fftfreq(GRID)[:, None]
-    fx = np.fft.fftfreq(GRID)[None, :]
+    fx, fy = frequency_grid(GRID)
     blur, target = (sensor_mtf(fx, fy, side) for side in (sensor, _reference()))
     r_squared = (fx**2 + fy**2) / NYQUIST**2
     epsilons = [EPSILON_PER_SIGMA * sigma * STEP ** (k - 1) for k in range(FILTERS)]

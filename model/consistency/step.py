@@ -54,7 +54,7 @@ from beers_deploy.model.consistency.detail import (
 )
 from beers_deploy.model.consistency.smooth import SMOOTH_PX, Smoothing
 from beers_deploy.model.departure import has_other_curve
-from beers_deploy.model.simulator.mtf import sensor_mtf
+from beers_deploy.model.simulator.mtf import frequency_grid, sensor_mtf
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import Array
 
@@ -217,19 +217,20 @@ class Consistency:
         any_missing = bool(missing.any())
         smooth = self.smoothing.smoothed(restored)
         finite = np.where(missing, np.float32(0), smooth) if any_missing else smooth
+        sides = down, across
         origin = down.start, across.start
-        near_pixels = extend(finite, (down, across), origin, NEAR_PX)
-        raw_pixels = extend(raw, (down, across), raw_at, 0)
+        near_pixels = extend(finite, sides, origin, NEAR_PX)
+        raw_pixels = extend(raw, sides, raw_at, 0)
         blurred = separable_sums(near_pixels, self.rows, self.columns, BLOCK_PX)
-        blurred += self._far(finite, missing if any_missing else None, down, across)
+        blurred += self._far(finite, missing if any_missing else None, sides)
         raw_means = block_means(raw_pixels)
         excess = np.interp(raw_means, self.means, self.excess, right=0.0).astype(np.float32)
         # A mean below the smallest possible value counts as no light.
         excess = np.minimum(excess, np.maximum(raw_means, np.float32(0)))
         residual = raw_means - excess - blurred
-        weights = free_blocks(raw >= self.full_scale, (down, across), raw_at, NEAR_PX)
+        weights = free_blocks(raw >= self.full_scale, sides, raw_at, NEAR_PX)
         if any_missing:
-            weights *= free_blocks(missing, (down, across), origin, NEAR_PX)
+            weights *= free_blocks(missing, sides, origin, NEAR_PX)
         share: Image | None = None
         if weights.all():
             change = interpolate(residual, down, across)
@@ -243,27 +244,24 @@ class Consistency:
             change += fine if share is None else np.where(share == 1, fine, np.float32(0))
         if smooth is not restored:
             rows, columns = (
-                slice(side.keep_start - side.start, side.keep_stop - side.start)
-                for side in (down, across)
+                slice(side.keep_start - side.start, side.keep_stop - side.start) for side in sides
             )
             change += np.where(missing, np.float32(0), smooth - restored)[rows, columns]
         return change
 
     def _far(
-        self, finite: Image, missing: NDArray[np.bool_] | None, down: Placed, across: Placed
+        self, finite: Image, missing: NDArray[np.bool_] | None, sides: tuple[Placed, Placed]
     ) -> Image:
         """Compute block means of the far part of H x.
 
         A block with missing pixels is replaced by the block in the middle.
         """
         around_px = BLOCK_PX * FAR_BLOCKS
-        origin = down.start, across.start
-        means = block_means(extend(finite, (down, across), origin, around_px))
+        origin = sides[0].start, sides[1].start
+        means = block_means(extend(finite, sides, origin, around_px))
         if missing is None:
             return self._around(means)
-        missing_share = block_means(
-            extend(missing.astype(np.float32), (down, across), origin, around_px)
-        )
+        missing_share = block_means(extend(missing.astype(np.float32), sides, origin, around_px))
         complete = (missing_share == 0).astype(np.float32)
         middle = means[FAR_BLOCKS:-FAR_BLOCKS, FAR_BLOCKS:-FAR_BLOCKS]
         # Where all blocks are whole the last factor is exactly 0, because both sums add the same
@@ -286,8 +284,7 @@ class Consistency:
 
 def blur_between(sensor: Instrument, reference: Instrument) -> Array:
     """Compute the filter H, centred on its first pixel, (GRID, GRID) float64 of sum 1."""
-    fy = np.fft.fftfreq(GRID)[:, None]
-    fx = np.fft.fftfreq(GRID)[None, :]
+    fx, fy = frequency_grid(GRID)
     ratio = sensor_mtf(fx, fy, sensor) / sensor_mtf(fx, fy, reference)
     return np.fft.ifft2(ratio / ratio[0, 0]).real
 

@@ -10,7 +10,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from itertools import chain, combinations
+from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -92,7 +92,10 @@ def _require_apart(
     inputs.
     """
     sources = [path for path in inputs if path is not None]
-    files = list(chain.from_iterable(map(_files_of, sources)))
+    files = [path for path in sources if not path.is_dir()]
+    for folder in filter(Path.is_dir, sources):
+        # The files in it that a command may read.
+        files += [file for file in folder.glob("*") if file.suffix.lower() in READ_SUFFIXES]
     images = [file for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
     # A path that does not exist has no identity, and cannot collide with another.
     identities = {_identity(file) for file in files} - {None}
@@ -143,15 +146,6 @@ def _identity(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return status.st_dev, status.st_ino
-
-
-def _files_of(path: Path) -> list[Path]:
-    """Return an input as a list of files: itself, or the files in a folder that a
-    command may read.
-    """
-    if not path.is_dir():
-        return [path]
-    return [file for file in path.glob("*") if file.suffix.lower() in READ_SUFFIXES]
 
 
 def _taken(path: Path, use: str) -> OptionError:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.instrument import MTF_NYQUIST_MAX, Instrument, mtf_limit
-from beers_deploy.profiles.response import PointSpread, Response
+from beers_deploy.profiles.response import Array, PointSpread, Response
 
 
 def gamma_from_mtf(mtf_nyquist: float, antialias_sigma_px: float = 0.0) -> float:
@@ -87,6 +87,14 @@ def mtf(
         return response
     # The transform of a Gaussian filter.
     return np.asarray(response * np.exp(-2 * (math.pi * antialias_sigma_px * radius) ** 2))
+
+
+def frequency_grid(side: int) -> tuple[Array, Array]:
+    """Return the frequencies fx (1, N) and fy (N, 1) of a spectrum of N x N in cycles per pixel, in
+    the order of a Fourier transform.
+    """
+    frequency = np.fft.fftfreq(side)
+    return frequency[None], frequency[:, None]
 
 
 def smear_response(fy: ArrayLike, length_px: float) -> NDArray[np.float64]:

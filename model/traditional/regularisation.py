@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from beers_deploy.model.simulator.detector import to_radiance
-from beers_deploy.model.simulator.mtf import sensor_mtf
+from beers_deploy.model.simulator.mtf import frequency_grid, sensor_mtf
 from beers_deploy.model.traditional.noise import with_rounding_noise
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import NYQUIST, Array
@@ -101,8 +101,7 @@ class NoiseAndScene:
         contrast = max(self.contrast, LEAST_CONTRAST * self.noise)
         # The mean squared difference of neighbouring pixels in an image of a scene whose power is
         # 1 / r^2, with r the frequency over Nyquist.
-        fy = np.fft.fftfreq(GRID)[:, None]
-        fx = np.fft.fftfreq(GRID)[None, :]
+        fx, fy = frequency_grid(GRID)
         r_squared = (fx**2 + fy**2) / NYQUIST**2
         # The mean of an image is no contrast, so the quotient is 0 there.
         r_squared[0, 0] = np.inf

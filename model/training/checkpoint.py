@@ -100,8 +100,8 @@ class Guards:
 
     def passed(self, step: int, loss: float) -> None:
         """Count the loss of a step, and raise ModelError if the mean of a window diverges."""
-        self.sum = self.sum + loss
-        self.count = self.count + 1
+        self.sum += loss
+        self.count += 1
         if self.count < WINDOW_STEPS:
             return
         mean = self.sum / self.count

@@ -221,26 +221,13 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
         The source of batches, the validation, and the names of the training images.
     """
     recipe = run.recipe
+    worker = trainer.worker
+    ranks = worker.rank, worker.count
     sensors = (run.patches.family or run.patches.degraded, run.patches.reference)
     if run.pairs is not None:
         files = pair_files(run.pairs)
-        degraded = run.patches.degraded
-        nominal = degraded.nominal()
-        mirrors, alike = nominal.symmetry
-        # Axes that are drawn from two ranges differ, even where the middles of the ranges agree.
-        ranges = degraded.mtf_nyquist_along is not None and degraded.response is None
-        turns = alike and not ranges
-        source = StoredPairs(
-            files,
-            run.patches.patch_px,
-            nominal.max_dn,
-            recipe.batch,
-            recipe.seed,
-            trainer.worker.rank,
-            trainer.worker.count,
-            turns,
-            mirrors,
-        )
+        sizes = run.patches.patch_px, recipe.batch
+        source = StoredPairs(files, run.patches.degraded, *sizes, recipe.seed, *ranks)
         return source.batches, Validation([], *sensors), [degraded.name for degraded, _ in files]
     scenes = read_scenes(run)
     training, held_out = split_by_site([scene.name for scene in scenes], run.held_out)
@@ -253,8 +240,6 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
     train_on = [scenes[number] for number in training] + synthetic
     if not train_on:
         raise OptionError("There is nothing to train on. Give `images`, `pairs` or `drawn`.")
-    worker = trainer.worker
-    ranks = worker.rank, worker.count
     patches = PatchSource(train_on, run.patches, recipe.batch, recipe.seed, *ranks, trainer.device)
     if patches.unused and worker.first:
         logger.warning(
@@ -297,9 +282,9 @@ def _train(run: Run, trainer: Trainer, batches: Batches, validation: Validation)
 
         def validate(step: int, network: Network) -> None:
             require_finite_output(network, f"The network at training step {step}")
-            judged = validation.judge(network)
-            scores.write(step, judged)
-            write_picture(validation, network, run.out / "validation.png")
+            restored = validation.restore(network)
+            scores.write(step, validation.judge(restored))
+            write_picture(validation, restored, run.out / "validation.png")
 
         every = run.validate_steps if validation.pairs else 0
         schedule = Schedule(validate_steps=every, report=report, validate=validate)

@@ -4,6 +4,7 @@ The spectrum of a scene is computed once. Each visit blurs, samples and folds it
 sensor, scale, phase and look. Visiting whole scenes yields many patches for one transform.
 """
 
+import itertools
 import os
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -32,6 +33,7 @@ from beers_deploy.model.training.passes import (
 from beers_deploy.model.training.patches import Files, PatchRecipe, draw_turn, turn
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Sensor
 
 
 class Batch(NamedTuple):
@@ -226,19 +228,16 @@ class StoredPairs:
     """Endless batches of (degraded, reference) patches, (N, 1, P, P) in [0, 1]; the same for the
     same seed.
 
-    `max_dn` is the largest digital number of the sensor that made the pairs. Patches may be turned
-    by `quarters` unless its two axes differ, and they have `mirrors` unless its blur is lopsided.
+    `sensor` made the pairs.
     """
 
     files: Sequence[Files]
+    sensor: Sensor
     patch_px: int
-    max_dn: int
     batch: int
     seed: int
     rank: int = 0
     workers: int = 1
-    quarters: bool = True
-    mirrors: bool = True
 
     def __post_init__(self) -> None:
         # A step may come late at a pair, so all headers are read before the first one.
@@ -252,26 +251,32 @@ class StoredPairs:
                     "smaller `patch`, or simulate larger patches."
                 )
 
+    @property
+    def symmetry(self) -> tuple[bool, bool]:
+        """Two flags: whether patches may be mirrored, and whether turned by 90 degrees."""
+        mirrors, quarters = self.sensor.nominal().symmetry
+        # Axes that are drawn from two ranges differ, even where the middles of the ranges agree.
+        drawn_apart = self.sensor.mtf_nyquist_along is not None and self.sensor.response is None
+        return mirrors, quarters and not drawn_apart
+
     def batches(self, first: int = 0) -> Iterator[Batch]:
         """Yield batch number `first` and all that follow."""
-        number = first
-        while True:
+        max_dn = self.sensor.nominal().max_dn
+        mirrors, quarters = self.symmetry
+        for number in itertools.count(first):
             # Keyed by the batch's number and not drawn in sequence: a resumed run draws the same.
             generator = Draw(self.seed, number * self.workers + self.rank).generator("stored")
             pairs = []
             for _ in range(self.batch):
                 # One patch (2, P, P) at a random place of a random pair.
                 files = self.files[int(generator.integers(len(self.files)))]
-                images = [
-                    read_acquisition(file, remedy=RESCALE, max_dn=self.max_dn) for file in files
-                ]
+                images = [read_acquisition(file, remedy=RESCALE, max_dn=max_dn) for file in files]
                 top, left = (
                     int(generator.integers(px - self.patch_px + 1)) for px in images[0].shape
                 )
                 window = slice(top, top + self.patch_px), slice(left, left + self.patch_px)
                 both = np.stack([np.float32(image[window]) for image in images])
-                turned = turn(both, generator, self.quarters, self.mirrors)
+                turned = turn(both, generator, quarters, mirrors)
                 pairs.append(torch.from_numpy(np.ascontiguousarray(turned)))
-            patches = torch.stack(pairs) / self.max_dn
+            patches = torch.stack(pairs) / max_dn
             yield Batch(patches[:, :1].contiguous(), patches[:, 1:].contiguous())
-            number += 1

@@ -150,11 +150,10 @@ class Step:
 
     def _backward(self, inputs: Inputs) -> tuple[Tensor, Mapping[str, Tensor]]:
         batch = inputs.batch
-        conditions = (
-            () if batch.condition is None else (batch.condition, self.bfloat16, inputs.steps)
-        )
-        keywords = {"bfloat16": self.bfloat16} if batch.condition is None else {}
-        restored = self.forward(batch.degraded, *conditions, **keywords)
+        options: dict[str, object] = {"bfloat16": self.bfloat16}
+        if batch.condition is not None:
+            options |= {"condition": batch.condition, "steps": inputs.steps}
+        restored = self.forward(batch.degraded, **options)
         total, terms = self.loss(restored, batch.reference)
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]

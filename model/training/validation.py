@@ -120,14 +120,15 @@ class Validation:
                 restored.append(restorer(extended)[0, 0, :height, :width].clamp(0, 1).numpy())
         return restored
 
-    def judge(self, network: Network) -> dict[str, float]:
-        """Compute means of the figures over all pairs, for a network on the CPU; PSNR is over full
-        scale.
+    def judge(self, restored: list[np.ndarray]) -> dict[str, float]:
+        """Compute means of the figures over all pairs; PSNR is over full scale.
+
+        Args:
+            restored: the restored images, as `restore` returns them.
 
         Returns:
             The means, by the names of a log's columns.
         """
-        restored = self.restore(network)
         references = [reference[0, 0].numpy() for _, reference in self.pairs]
         inputs = [degraded[0, 0].numpy() for degraded, _ in self.pairs]
         judged = {
@@ -143,13 +144,11 @@ class Validation:
         }
 
 
-def write_picture(validation: Validation, network: Network, path: Path) -> None:
+def write_picture(validation: Validation, restored: list[np.ndarray], path: Path) -> None:
     """Draw the busiest crop of each validation image: degraded, restored, reference."""
     rows: list[list[np.ndarray]] = []
-    for (degraded, reference), restored in zip(
-        validation.pairs, validation.restore(network), strict=True
-    ):
-        images = [degraded[0, 0].numpy(), restored, reference[0, 0].numpy()]
+    for (degraded, reference), result in zip(validation.pairs, restored, strict=True):
+        images = [degraded[0, 0].numpy(), result, reference[0, 0].numpy()]
         side = min(VALIDATION_CROP_PX, *images[0].shape)
         top, left = busiest_windows(images[2], side)[0]
         crops = (image[top : top + side, left : left + side] for image in images)

@@ -276,7 +276,8 @@ def test_pairs_bring_their_sensor_and_its_full_scale(
     monkeypatch.setattr(training, "StoredPairs", kept)
     done(command)
     assert load_network(tmp_path / "r" / "convbeers-xs.safetensors")[1]["degraded"] == "mine"
-    assert (stores[0].max_dn, stores[0].quarters) == (16383, False)
+    assert stores[0].sensor.nominal().max_dn == 16383
+    assert stores[0].symmetry == (True, False)
 
 
 @pytest.mark.parametrize("more", ["--validate-every 2", "--conditioned"])

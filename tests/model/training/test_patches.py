@@ -27,6 +27,8 @@ from tests.model.simulator.stages import NOMINAL, point_spread, with_response
 from tests.model.training.sources import small_scene, source
 from tests.project_files import ROOT
 
+PROFILE = Sensor.load("pleiades-degraded")
+
 
 def test_the_same_seed_gives_the_same_batches_from_anywhere() -> None:
     straight = source().batches()
@@ -146,9 +148,8 @@ def test_dark_patches_are_brightened_as_in_a_restoration() -> None:
 
 def test_patches_of_one_sensor_keep_its_axes() -> None:
     """Without a condition, patches are only turned by 180 degrees or mirrored."""
-    profile = Sensor.load("pleiades-degraded")
-    across, along = (replace(profile.mtf_nyquist, value=value) for value in (0.3, 0.03))
-    anisotropic = replace(profile, mtf_nyquist=across, mtf_nyquist_along=along)
+    across, along = (replace(PROFILE.mtf_nyquist, value=value) for value in (0.3, 0.03))
+    anisotropic = replace(PROFILE, mtf_nyquist=across, mtf_nyquist_along=along)
     recipe = replace(source().recipe, degraded=anisotropic, oversamplings=(2,))
     for batch in islice(PatchSource([NOISE], recipe, 3, 0).batches(), 30):
         clearer, blurred = contrasts(batch.degraded, batch.reference)
@@ -219,7 +220,7 @@ def write_pairs(folder: Path, *degraded: np.ndarray) -> StoredPairs:
     for k, image in enumerate(degraded or noise):
         write_tiff(folder / "degraded" / f"p{k}.tif", image)
         write_tiff(folder / "reference" / f"p{k}.tif", 2 * image)
-    return StoredPairs(pair_files(folder), 24, 4095, batch=4, seed=0)
+    return StoredPairs(pair_files(folder), PROFILE, 24, batch=4, seed=0)
 
 
 def test_stored_pairs_are_cut_alike_and_the_same_from_anywhere(tmp_path: Path) -> None:
@@ -235,9 +236,13 @@ def test_stored_pairs_are_cut_alike_and_the_same_from_anywhere(tmp_path: Path) -
 
 @pytest.mark.parametrize("quarters", [True, False])
 def test_stored_pairs_of_two_different_axes_keep_them(quarters: bool, tmp_path: Path) -> None:
-    """Rows of one brightness stay rows, unless patches may be turned by 90 degrees."""
+    """Rows of one brightness stay rows, unless patches may be turned by 90 degrees.
+
+    They may not if the axes are drawn from two ranges, even from equal ones.
+    """
     rows = np.repeat(np.arange(41, dtype=np.uint16)[:, None] * 45, 53, 1)
-    patches, *_ = next(replace(write_pairs(tmp_path, rows), batch=32, quarters=quarters).batches())
+    sensor = PROFILE if quarters else replace(PROFILE, mtf_nyquist_along=PROFILE.mtf_nyquist)
+    patches, *_ = next(replace(write_pairs(tmp_path, rows), batch=32, sensor=sensor).batches())
     flat = [bool((patch == patch[..., :1]).all()) for patch in patches]
     assert any(flat)
     assert all(flat) is not quarters

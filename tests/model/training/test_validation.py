@@ -44,9 +44,10 @@ def test_a_new_network_is_judged_like_its_input_also_on_odd_sides_at_half_resolu
     network = ConvBEERS(Variant(1, 4, scale)).eval()
     for parameter in network.tail.parameters():
         parameter.data.zero_()
-    judged = validation.judge(network)
-    assert validation.restore(network)[0].shape == validation.pairs[0][0].shape[-2:]
+    restored = validation.restore(network)
+    judged = validation.judge(restored)
+    assert restored[0].shape == validation.pairs[0][0].shape[-2:]
     assert judged["psnr_db"] == judged["degraded_psnr_db"]
     assert 0.5 < judged["ssim"] < 1
-    repeated = Validation(scenes, *SENSORS).judge(network)
-    assert repeated == judged
+    again = Validation(scenes, *SENSORS)
+    assert again.judge(again.restore(network)) == judged
