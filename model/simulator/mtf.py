@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.instrument import MTF_NYQUIST_MAX, Instrument, mtf_limit
-from beers_deploy.profiles.response import Array, PointSpread, Response
+from beers_deploy.profiles.response import Frequencies, PointSpread, Response
 
 
 def gamma_from_mtf(mtf_nyquist: float, antialias_sigma_px: float = 0.0) -> float:
@@ -89,7 +89,7 @@ def mtf(
     return np.asarray(response * np.exp(-2 * (math.pi * antialias_sigma_px * radius) ** 2))
 
 
-def frequency_grid(side: int) -> tuple[Array, Array]:
+def frequency_grid(side: int) -> tuple[Frequencies, Frequencies]:
     """Return the frequencies fx (1, N) and fy (N, 1) of a spectrum of N x N in cycles per pixel, in
     the order of a Fourier transform.
     """

@@ -127,13 +127,6 @@ def test_frames_do_not_change_the_site(place: str, frame: str, other: str, suffi
     assert site_of(place + frame + other + suffix) == place
 
 
-@given(PLACE, PLACE, FRAME)
-def test_places_stay_apart(place: str, other: str, frame: str) -> None:
-    assume(place != other)
-    assume(not {place.split("_")[-1], other.split("_")[-1]} & CAMERAS)
-    assert site_of(place + frame) != site_of(other + frame)
-
-
 @pytest.mark.parametrize(
     ("name", "site"),
     [

@@ -19,51 +19,6 @@ from tests.model.simulator.stages import NOMINAL, REFERENCE
 QUIET = Instrument(0.07, alpha=0.0, beta=0.0, gain_dn_per_radiance=10.0, bits=16)
 
 
-@pytest.mark.parametrize("cycles_per_px", [0.1, 0.25, 0.4])
-@pytest.mark.parametrize("mtf_nyquist", [0.03, 0.07, 0.25])
-def test_a_sine_keeps_the_contrast_that_the_mtf_says(
-    cycles_per_px: float, mtf_nyquist: float
-) -> None:
-    ratio = 4
-    pixels = 40
-    x = (np.arange(pixels * ratio) + 0.5) / ratio
-    wave = 1000 + 500 * np.cos(2 * math.pi * cycles_per_px * x)
-    radiance = np.tile(wave.astype(np.float32), (pixels * ratio, 1))
-    sensor = Instrument(mtf_nyquist, 0.0, 0.0, 10.0, 16)
-    dn = acquire(prepare_scene(radiance, ratio), sensor, Draw(0), margin_px=0)
-    line = dn.mean(0, np.float64) / 10
-    bin_ = round(cycles_per_px * pixels)
-    contrast = 2 * abs(np.fft.rfft(line)[bin_]) / pixels / 500
-    gamma = -2 * math.log(mtf_nyquist * math.pi / 2)
-    expected = (
-        math.exp(-gamma * cycles_per_px)
-        * math.sin(math.pi * cycles_per_px)
-        / (math.pi * cycles_per_px)
-    )
-    assert contrast == pytest.approx(expected, abs=1e-3)
-
-
-def steepest_fall(ratio: int, mtf_nyquist: float) -> float:
-    """Return the largest fall between neighbours, in DN, across an upward step of 1500 DN."""
-    side = 96 * ratio
-    step = np.full((side, side), 50.0, np.float32)
-    step[:, side // 2 :] = 200.0
-    sensor = Instrument(mtf_nyquist, 0.0, 0.0, 10.0, 16)
-    line = acquire(prepare_scene(step, ratio), sensor, Draw(0), margin_px=16)[0]
-    return float(-np.diff(line).min())
-
-
-@pytest.mark.parametrize("mtf_nyquist", [0.03, 0.07, 0.25])
-@pytest.mark.parametrize("ratio", [1, 2, 3, 5])
-def test_a_step_rises_without_ringing(ratio: int, mtf_nyquist: float) -> None:
-    # A fall of one digital number comes from rounding alone.
-    assert steepest_fall(ratio, mtf_nyquist) <= 1
-
-
-def test_a_step_would_ring_where_the_scene_is_no_finer_than_the_sensor() -> None:
-    assert steepest_fall(1, 0.6) > 10
-
-
 def test_the_two_noises_of_a_pair_are_independent() -> None:
     pair = simulate_pair(np.full((900, 960), 80.0, np.float32), NOMINAL, REFERENCE, 5, Draw(0))
     noise = [image.ravel() - image.mean() for image in (pair.degraded, pair.reference)]

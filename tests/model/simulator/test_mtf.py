@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beers_deploy.model.simulator.mtf import gamma_from_mtf, mtf
+from beers_deploy.model.simulator.mtf import mtf
 from beers_deploy.profiles.errors import OptionError
 
 TWO_OVER_PI = 2 / math.pi
@@ -18,12 +18,6 @@ def test_it_is_the_formula_of_the_paper(mtf_nyquist: float, fx: float, fy: float
     decay = (mtf_nyquist / TWO_OVER_PI) ** (2 * math.hypot(fx, fy))
     expected = decay * np.sinc(fx) * np.sinc(fy)
     assert float(mtf(fx, fy, mtf_nyquist)) == pytest.approx(expected, rel=1e-9, abs=0)
-
-
-def test_known_gammas() -> None:
-    for mtf_nyquist, gamma in ((0.07, 4.415), (0.25, 1.869), (0.03, 6.110), (0.001, 12.91)):
-        assert gamma_from_mtf(mtf_nyquist) == pytest.approx(gamma, abs=5e-3)
-    assert gamma_from_mtf(TWO_OVER_PI) == 0
 
 
 def grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:

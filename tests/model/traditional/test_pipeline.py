@@ -97,8 +97,8 @@ def test_both_orders_of_the_pipeline_gain_the_measured_decibels(
 @pytest.mark.parametrize("order", ORDERS)
 def test_strips_change_no_bit(order: Order, pair: AcquiredPair) -> None:
     pipeline = TraditionalPipeline(NOMINAL, REFERENCE, "fast", order)
-    dn = pair.degraded.clone()
-    dn[:9, 20:50] = torch.nan
+    dn = pair.degraded[:, :53].clone()
+    dn[:9, 20:40] = torch.nan
     fitted = pipeline.fitted_to(torch.split(dn, 31))
     strips = torch.cat(list(restore_strips(torch.split(dn, 23), dn.shape[0], fitted)))
     at_once = restore_traditional(dn, pipeline)

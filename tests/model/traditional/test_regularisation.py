@@ -162,9 +162,7 @@ def test_strips_need_an_epsilon_and_a_given_one_is_kept() -> None:
 
 def test_the_restored_mtf_comes_near_that_of_the_reference() -> None:
     """The reference has 25 %; an earlier rule, of the noise alone, restored 16 % (measured)."""
-    mtfs = [
-        restored_mtf(angle_deg, number) for number, angle_deg in enumerate((3.0, 5.0, 8.0, 11.0))
-    ]
+    mtfs = [restored_mtf(angle_deg, number) for number, angle_deg in enumerate((3.0, 11.0))]
     assert 0.20 < float(np.mean(mtfs)) < 0.26
 
 

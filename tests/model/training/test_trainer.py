@@ -27,6 +27,7 @@ from beers_deploy.model.training.source import Batch, PatchSource
 from beers_deploy.model.training.trainer import Precision, Schedule, Trainer, Worker
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError, OptionError
+from tests.model.networks import plain
 from tests.model.training.sources import small_scene, source
 from tests.project_files import ROOT
 
@@ -36,7 +37,6 @@ RECIPE = TrainingRecipe(steps=8, batch=3, warm_up_steps=2)
 
 def train(
     folder: Path,
-    steps: int = 8,
     *,
     conditioned: bool = False,
     resume: bool = False,
@@ -48,9 +48,7 @@ def train(
         if step == kill_at:
             raise KeyboardInterrupt
 
-    trainer = Trainer(
-        VARIANT, TrainingRecipe(steps=steps, batch=3, warm_up_steps=2), conditioned=conditioned
-    )
+    trainer = Trainer(VARIANT, RECIPE, conditioned=conditioned)
     checkpoint = folder / "checkpoint.safetensors"
     if resume:
         trainer.resume(checkpoint)
@@ -89,6 +87,9 @@ def test_killed_and_resumed_equals_unbroken_in_every_bit(
     unbroken = train(tmp_path / "a", conditioned=conditioned)
     with pytest.raises(KeyboardInterrupt):
         train(tmp_path / "b", conditioned=conditioned, kill_at=kill_at)
+    saved = Trainer(VARIANT, RECIPE, conditioned=conditioned)
+    saved.resume(tmp_path / "b" / "checkpoint.safetensors")
+    assert saved.step == kill_at - 1
     resumed = train(tmp_path / "b", conditioned=conditioned, resume=True)
     for trainer, folder in ((unbroken, "a"), (resumed, "b")):
         finish(trainer.averaged(), tmp_path / folder / "weights.safetensors", {"steps": 8})
@@ -99,14 +100,6 @@ def test_killed_and_resumed_equals_unbroken_in_every_bit(
         assert header == other_header
         assert tensors.keys() == others.keys()
         assert all(np.array_equal(tensor, others[name]) for name, tensor in tensors.items())
-
-
-def test_a_resumed_run_continues_where_the_killed_one_was_saved(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        train(tmp_path, kill_at=5)
-    later = Trainer(VARIANT, RECIPE)
-    later.resume(tmp_path / "checkpoint.safetensors")
-    assert later.step == 4
 
 
 class Poisoned(PatchSource):
@@ -165,15 +158,12 @@ def test_ctrl_c_finishes_the_step_and_leaves_a_checkpoint_of_it(
         if step == 4:
             signal.raise_signal(number)
 
-    trainer = Trainer(VARIANT, RECIPE)
+    trainer, saved = (Trainer(VARIANT, RECIPE) for _ in range(2))
     with pytest.raises(KeyboardInterrupt):
-        trainer.run(
-            source().batches, tmp_path / "checkpoint.safetensors", Schedule(1, report=report)
-        )
-    assert trainer.step == 4
-    resumed = train(tmp_path, resume=True)
-    unbroken = train(tmp_path / "b")
-    assert all(map(torch.equal, copies(resumed), copies(unbroken)))
+        trainer.run(source().batches, tmp_path / "c", Schedule(1, report=report))
+    saved.resume(tmp_path / "c")
+    assert saved.step == trainer.step == 4
+    assert all(map(torch.equal, copies(saved), copies(trainer)))
 
 
 def test_a_second_ctrl_c_stops_at_once() -> None:
@@ -323,8 +313,8 @@ def test_a_recorded_step_learns_as_the_processor_does(conditioned: bool, tmp_pat
     np.testing.assert_allclose(losses["cuda"], losses["cpu"], rtol=0.02)
 
 
-def test_fine_tuning_starts_from_the_weights_given(tmp_path: Path) -> None:
-    first = train(tmp_path, 4).averaged()
+def test_fine_tuning_starts_from_the_weights_given() -> None:
+    first = plain(VARIANT, seed=7)
     tuned = Trainer(VARIANT, TrainingRecipe(steps=4), start=first)
     assert all(
         torch.equal(a, b)
