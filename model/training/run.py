@@ -329,9 +329,12 @@ def about(
 ) -> dict[str, object]:
     """Return the facts of a run for the header of its weights: everything but the machine."""
     patches = run.patches
+    lpips = "squeeze" if loss.perceptual is not None else "left out: no weights"
+    if not run.recipe.loss.lpips:
+        lpips = "left out: its weight is 0"
     return {
         "training": asdict(run.recipe),
-        "lpips": "squeeze" if loss.perceptual is not None else "left out: no weights",
+        "lpips": lpips,
         "start": run.start.name if run.start else "drawn weights",
         "degraded": patches.degraded.name if patches.family is None else "drawn over the ranges",
         "reference": patches.reference.name,

@@ -207,8 +207,9 @@ def test_a_run_at_half_resolution_starts_from_a_network_at_full_resolution(
 ) -> None:
     start = banked_weights(tmp_path)
     options = f"--variant convbeers-half --conditioned --validate-every 2 --start {start}"
-    run(images, tmp_path / "still", f"{options} --learning-rate 0", steps=1)
+    run(images, tmp_path / "still", f"{options} --learning-rate 0 --lpips-weight 0", steps=1)
     weights = tmp_path / "still" / "convbeers-half.safetensors"
+    assert load_network(weights)[1]["lpips"] == "left out: its weight is 0"
     image = torch.rand(1, 1, 26, 34, generator=torch.Generator().manual_seed(0))
     vector = torch.tensor([0.3, 0, -1, 1])
     torch.testing.assert_close(
