@@ -48,10 +48,20 @@ ROWS = 333
 COLUMNS = 301
 
 
+GAUSSIAN = with_response(plain_sensor(), gaussian_pixel(1.1, 1.1, 8, 129))
+"""A sensor whose blur is a Gaussian of 1.1 pixels."""
+
+
+@cache
+def whole_step_for(name: str) -> Consistency:
+    """Return the consistency step of a sensor, or of GAUSSIAN."""
+    return Consistency.of(SENSORS.get(name, GAUSSIAN), REFERENCE)
+
+
 @cache
 def step_for(name: str) -> Consistency:
     """Return the consistency step without the step for finer detail."""
-    return replace(Consistency.of(SENSORS[name], REFERENCE), detail=None)
+    return replace(whole_step_for(name), detail=None)
 
 
 @cache

@@ -28,12 +28,13 @@ from tests.model.consistency.images import (
     scene,
     sigma_dn,
     step_for,
+    whole_step_for,
 )
 from tests.model.simulator.stages import REFERENCE, plain_sensor
 
 Cut = tuple[int, int, int, int]
 
-WITH_DETAIL = Consistency.of(SENSORS["lopsided point"], REFERENCE)
+WITH_DETAIL = whole_step_for("lopsided point")
 
 
 def corrected_in_part(

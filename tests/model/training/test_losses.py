@@ -1,4 +1,4 @@
-"""Tests of the loss: its terms, their balance, and finite gradients where images are equal."""
+"""Tests of the loss: its terms and their sum. `tests.stability` compares it with its formula."""
 
 import math
 
@@ -7,12 +7,12 @@ import torch
 from torch import Tensor, nn
 
 from beers_deploy.model.metrics.perceptual import Lpips
-from beers_deploy.model.training.losses import PAPER, LossWeights, RestorationLoss, fft_l1, log_mse
+from beers_deploy.model.training.losses import PAPER, LossWeights, RestorationLoss, log_mse
 
 
-def images(side: int = 33, batch: int = 2, seed: int = 0) -> tuple[Tensor, Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    reference = torch.rand(batch, 1, side, side + 4, generator=generator)
+def images(side: int = 33) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    reference = torch.rand(2, 1, side, side + 4, generator=generator)
     return reference + 0.01 * torch.randn(reference.shape, generator=generator), reference
 
 
@@ -25,21 +25,6 @@ class Distance(nn.Module):
 
 def with_distance() -> Lpips:
     return Distance()  # type: ignore[return-value]
-
-
-@pytest.mark.parametrize("side", [32, 64, 128, 256])
-def test_the_fft_term_does_not_depend_on_the_patch_size(side: int) -> None:
-    """Trap 14: the default norm would make it 36, 71, 142 and 285 times the L1."""
-    restored, reference = images(side)
-    l1 = float((restored - reference).abs().mean())
-    assert float(fft_l1(restored, reference)) / l1 == pytest.approx(1.11, abs=0.03)
-
-
-def test_gradients_are_finite_where_images_are_equal() -> None:
-    restored = images()[1].requires_grad_()
-    fft_l1(restored, images()[1]).backward()  # type: ignore[no-untyped-call]
-    assert restored.grad is not None
-    assert bool((restored.grad == 0).all())
 
 
 def test_the_terms_add_up() -> None:
