@@ -82,16 +82,19 @@ class Place:
 
         A pixel's corner at (column, row) moves to `scale` times both. Rational polynomials count
         from the middle of the first pixel, so their offsets also move by half a pixel (NITF
-        STDI-0002, RPC00B).
+        STDI-0002, RPC00B). Polynomials whose offsets or scales are no numbers are left out.
         """
         if scale == 1:
             return self
         coefficients = dict(self.rpcs)
         points = tuple((row * scale, column * scale, x, y, z) for row, column, x, y, z in self.gcps)
-        for key in coefficients.keys() & {"LINE_OFF", "SAMP_OFF"}:
-            coefficients[key] = repr((_number(coefficients[key]) + 0.5) * scale - 0.5)
-        for key in coefficients.keys() & {"LINE_SCALE", "SAMP_SCALE"}:
-            coefficients[key] = repr(_number(coefficients[key]) * scale)
+        try:
+            for key in coefficients.keys() & {"LINE_OFF", "SAMP_OFF"}:
+                coefficients[key] = repr((_number(coefficients[key]) + 0.5) * scale - 0.5)
+            for key in coefficients.keys() & {"LINE_SCALE", "SAMP_SCALE"}:
+                coefficients[key] = repr(_number(coefficients[key]) * scale)
+        except (ValueError, IndexError):
+            coefficients = {}
         transform = self.transform
         if transform is not None:
             a, b, c, d, e, f = transform[:6]

@@ -47,6 +47,13 @@ def test_the_pixels_of_an_enlarged_pixel_keep_its_middle(
         )
 
 
+@pytest.mark.parametrize("text", ["none", " "])
+@pytest.mark.parametrize("key", ["LINE_OFF", "SAMP_SCALE"])
+def test_polynomials_that_are_no_numbers_do_not_stop_an_enlargement(key: str, text: str) -> None:
+    polynomials = {"LINE_OFF": "20.5", "SAMP_SCALE": "2", key: text}
+    assert Place(rpcs=tuple(polynomials.items())).enlarged(2).rpcs == ()
+
+
 def test_a_scale_of_1_keeps_the_place() -> None:
     place = Place(rpcs=(("LINE_OFF", "1"),))
     assert place.enlarged(1) is place
