@@ -12,6 +12,7 @@ from beers_deploy.model.convbeers import (
     BankedConvBEERS,
     ConvBEERS,
     OfOneSensor,
+    for_sensor,
     network_of,
     vector_tensor,
 )
@@ -39,7 +40,7 @@ def torch_network(path: Path, sensor: Instrument | None) -> ConvBEERS | OfOneSen
     """
     network = network_of(read_plain(path) if sensor is None else read_conditioned(path))
     if sensor is not None and isinstance(network, BankedConvBEERS):
-        return OfOneSensor(network, vector_tensor(sensor), network_bank(sensor, network.kernels))
+        return for_sensor(network, vector_tensor(sensor), network_bank(sensor, network.kernels))
     # `read_plain` reads no other network.
     return cast(ConvBEERS, network)
 

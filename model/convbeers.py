@@ -272,23 +272,18 @@ class OfOneSensor(nn.Module):
 
     Args:
         network: the network for every sensor.
-        vector: the sensor vector (4,): MTF across and along the track and noise at two
-            brightnesses, each scaled to [-1, 1].
-        bank: the filters of the sensor; None builds those of the vector's MTF and noise.
+        condition: the description of the sensor.
     """
 
-    def __init__(self, network: BankedConvBEERS, vector: Tensor, bank: Bank | None = None) -> None:
+    def __init__(self, network: BankedConvBEERS, condition: Condition) -> None:
         super().__init__()
         self.network = network
-        self.vector = vector
-        self.bank = bank
+        self.condition = condition
         self.variant = network.variant
 
     def forward(self, image: Tensor) -> Tensor:
         """Restore images (N, 1, H, W) in [0, 1] of full scale."""
-        bank = self.bank or bank_of_vector(tuple(self.vector.tolist()), self.network.kernels)
-        condition = Condition.of(self.vector[None], [bank])
-        restored: Tensor = self.network(image, condition.repeated(len(image)))
+        restored: Tensor = self.network(image, self.condition.repeated(len(image)))
         return restored
 
 
@@ -304,10 +299,14 @@ def for_sensor(
     Args:
         network: a network behind a bank is conditioned on the sensor; a plain one is returned
             unchanged.
-        vector: the sensor vector (4,).
-        bank: the bank of the sensor; None builds it from the vector.
+        vector: the sensor vector (4,): MTF across and along the track and noise at two
+            brightnesses, each scaled to [-1, 1].
+        bank: the bank of the sensor; None builds that of the vector's MTF and noise.
     """
-    return OfOneSensor(network, vector, bank) if isinstance(network, BankedConvBEERS) else network
+    if isinstance(network, ConvBEERS):
+        return network
+    bank = bank or bank_of_vector(tuple(vector.tolist()), network.kernels)
+    return OfOneSensor(network, Condition.of(vector[None], [bank]))
 
 
 def initialise(network: Network, generator: torch.Generator) -> None:
