@@ -31,10 +31,9 @@ def noise_sigma(radiance: np.ndarray, sensor: Instrument) -> np.ndarray:
     """Compute sigma(L) = sqrt(alpha L + beta), in W/m2/sr/um, for radiances of any shape (paper,
     section 3.3).
 
-    Ringing can make L negative, where there is no photon noise: L counts as 0 there. A negative
-    variance (possible only for a sensor built by hand) also counts as 0.
+    Ringing can make L negative, where there is no photon noise: L counts as 0 there.
     """
-    return np.asarray(np.sqrt(np.maximum(sensor.alpha * np.maximum(radiance, 0) + sensor.beta, 0)))
+    return np.asarray(np.sqrt(sensor.alpha * np.maximum(radiance, 0) + sensor.beta))
 
 
 def add_noise(

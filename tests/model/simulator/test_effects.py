@@ -32,7 +32,6 @@ from beers_deploy.profiles.effects import (
     Striping,
 )
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.instrument import Instrument
 from tests.model.simulator import stages
 
 NEUTRAL: dict[str, Effect] = {
@@ -178,11 +177,6 @@ def test_snr_is_a_linear_ratio_not_decibels() -> None:
 def test_ringing_below_zero_is_harmless() -> None:
     noise = noise_sigma(np.array([-50.0, 0.0], np.float32), SENSOR)
     assert noise.tolist() == pytest.approx([SENSOR.beta**0.5] * 2)
-
-
-def test_an_impossible_hand_made_sensor_gives_no_nan() -> None:
-    sensor = Instrument(0.07, alpha=-0.01, beta=0.5, gain_dn_per_radiance=10.0, bits=12)
-    assert float(noise_sigma(np.array(300, np.float32), sensor)) == 0
 
 
 def test_clipping_comes_before_the_cast() -> None:
