@@ -1,6 +1,7 @@
 """Small cores of integers with every kind of operation, drawn by Hypothesis."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from hypothesis import strategies as st
@@ -78,21 +79,27 @@ class CoreDrawer:
         """Return the name of the next result."""
         return f"t{len(self.ops)}"
 
-    def window(self, kernel: tuple[int, int], size: tuple[int, int], plain: bool = False) -> Window:
-        """Draw a window that has at least one place on a map of this size."""
+    def window(
+        self, kernel: tuple[int, int], source: str, plain: bool = False
+    ) -> tuple[Window, list[int]]:
+        """Draw a window that has at least one place on a map, and return the number of its rows and
+        columns of places as well.
+        """
+        size = self.shapes[source][1:]
         pads = tuple(self.number(0, kernel[axis % 2] - 1) for axis in range(4))
         dilations = (1, 1) if plain else (self.number(1, 2), self.number(1, 2))
         window = Window((self.number(1, 3), self.number(1, 2)), pads, dilations)  # type: ignore[arg-type]
         places = [window.output_size(axis, kernel[axis], size[axis]) for axis in (0, 1)]
-        return window if min(places) > 0 else Window()
+        if min(places) > 0:
+            return window, places
+        return Window(), [size[axis] - kernel[axis] + 1 for axis in (0, 1)]
 
     def convolution(self, source: str, outputs: int, groups: int = 1) -> None:
         """Append a convolution with a kernel that fits its map."""
-        channels, *size = self.shapes[source]
-        kernel = tuple(self.number(1, min(side, 4)) for side in size)
-        window = self.window(kernel, (size[0], size[1]))  # type: ignore[arg-type]
-        sizes = [window.output_size(axis, kernel[axis], size[axis]) for axis in (0, 1)]
-        self._conv(source, (outputs, channels // groups, *kernel), window, sizes, groups)
+        channels, rows, columns = self.shapes[source]
+        kernel = (self.number(1, min(rows, 4)), self.number(1, min(columns, 4)))
+        drawn = self.window(kernel, source)
+        self._conv(source, (outputs, channels // groups, *kernel), *drawn, groups)
 
     def _transposed(self, source: str) -> None:
         """Append a transposed convolution whose result is not smaller than its map."""
@@ -198,20 +205,19 @@ class CoreDrawer:
 
     def _maximum(self, source: str) -> None:
         """Append a maximum over windows, which may be dilated."""
-        self._pool(source, MaxPool, plain=False)
+        self._pool(source, MaxPool)
 
     def _mean(self, source: str) -> None:
         """Append a mean over windows, which is not dilated."""
-        self._pool(source, AveragePool, plain=True)
+        self._pool(source, AveragePool)
 
-    def _pool(self, source: str, pool: type[MaxPool | AveragePool], plain: bool) -> None:
+    def _pool(self, source: str, pool: type[MaxPool | AveragePool]) -> None:
         """Append a pooling, which keeps the scale of what it reads."""
-        channels, *size = self.shapes[source]
-        kernel = (self.number(1, min(size[0], 3)), self.number(1, min(size[1], 3)))
-        window = self.window(kernel, (size[0], size[1]), plain)
-        rows, columns = (window.output_size(axis, kernel[axis], size[axis]) for axis in (0, 1))
+        channels, rows, columns = self.shapes[source]
+        kernel = (self.number(1, min(rows, 3)), self.number(1, min(columns, 3)))
+        window, places = self.window(kernel, source, plain=pool is AveragePool)
         op = pool(self.name(), source, self.result(), kernel, window)
-        self.append(op, (channels, rows, columns), self.frac_bits[source])
+        self.append(op, (channels, places[0], places[1]), self.frac_bits[source])
 
     def _enlarge(self, source: str, factor: int, bilinear: bool) -> None:
         """Append an enlargement, which keeps the scale of what it reads."""
@@ -256,8 +262,7 @@ class CoreDrawer:
         self.convolution(self.ops[-1].output, 2)
         last = self.ops.pop()
         assert isinstance(last, IntConv)
-        fields = {**vars(last), "output": CORRECTION}
-        self.ops.append(IntConv(**fields))
+        self.ops.append(replace(last, output=CORRECTION))
         self.frac_bits[CORRECTION] = self.frac_bits[last.output]
         part = HostPart(outputs=2, adds_image=False)
         return IntCore(tuple(self.ops), self.frac_bits, part)
