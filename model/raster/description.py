@@ -28,6 +28,8 @@ NOT_COPIED = ("STATISTICS_", "TIFFTAG_", "NITF_", "AREA_OR_POINT", "METADATATYPE
 """Prefixes of metadata items that are not copied to a restored image: they describe the raw pixels
 or the raw file, or are written from other facts.
 """
+UNWRITABLE = ("bidx", "ns")
+"""Metadata items that rasterio cannot write, because options of its function have these names."""
 
 
 def mask_file(path: Path) -> Path:
@@ -88,7 +90,7 @@ def raster_of(path: Path, dataset: Any) -> Raster:
             crs=points_crs if points else dataset.crs,
             transform=None if points or dataset.transform.is_identity else dataset.transform,
             gcps=tuple((at.row, at.col, at.x, at.y, at.z or 0.0) for at in points),
-            rpcs=tuple(sorted(dataset.tags(ns="RPC").items())),
+            rpcs=_retained_tags(dataset.tags(ns="RPC")),
             area_or_point=tags.get("AREA_OR_POINT", ""),
         ),
         band_info=tuple(
@@ -161,5 +163,7 @@ def _bits(path: Path, dataset: Any) -> int | None:
 def _retained_tags(tags: dict[str, str]) -> tuple[tuple[str, str], ...]:
     """Return the metadata items that are copied to a restored image."""
     return tuple(
-        (key, text) for key, text in sorted(tags.items()) if not key.startswith(NOT_COPIED)
+        (key, text)
+        for key, text in sorted(tags.items())
+        if not key.startswith(NOT_COPIED) and key not in UNWRITABLE
     )

@@ -11,6 +11,7 @@ from numpy.testing import assert_array_equal
 from PIL import Image
 
 from beers_deploy.model.raster.reader import LEAST_CACHE_BYTES, open_raster
+from beers_deploy.model.raster.writer import write_array
 from beers_deploy.profiles.errors import BeersError, ImageError
 from tests.model.raster import formats
 
@@ -124,6 +125,19 @@ def test_statistics_of_the_raw_pixels_are_not_kept(tmp_path: Path) -> None:
         raster = source.raster
     assert (raster.tags, raster.band_info[0].tags) == ((("MISSION", "a"),), (("GAIN", "2"),))
     assert raster.band_names == ("B0", "B1")
+
+
+def test_items_that_rasterio_cannot_write_are_not_kept(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "a.tif", pixels_of("uint16"))
+    items = "".join(f'<MDI key="{key}">1</MDI>' for key in ("bidx", "ns", "OWN"))
+    domains = "".join(f'<Metadata domain="{domain}">{items}</Metadata>' for domain in ("", "RPC"))
+    (tmp_path / "a.tif.aux.xml").write_text(f"<PAMDataset>{domains}</PAMDataset>")
+    with open_raster(tmp_path / "a.tif") as source:
+        raster = source.raster
+    assert raster.tags == raster.place.rpcs == (("OWN", "1"),)
+    write_array(tmp_path / "b.tif", raster, pixels_of("uint16")[None])
+    with open_raster(tmp_path / "b.tif") as source:
+        assert source.raster.tags == raster.tags
 
 
 def test_sidecars_place_an_image(tmp_path: Path) -> None:
