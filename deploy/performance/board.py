@@ -6,7 +6,7 @@ cannot be tiled are predicted by the frame.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -98,7 +98,7 @@ class Bench(Table):
     """
 
     swath: Swath | None = None
-    dn: np.ndarray | None = None
+    dn: np.ndarray | None = field(default=None, compare=False)
 
     @property
     def layers(self) -> list[Row]:

@@ -1,6 +1,7 @@
 import json
 import math
 import platform
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,9 @@ import jsonschema
 import numpy as np
 import pytest
 
+import beers_deploy as bd
 from beers_deploy.model.processor import processor_name
+from beers_deploy.performance.board import Bench
 from beers_deploy.profiles.figures import (
     Check,
     Figure,
@@ -200,3 +203,12 @@ def test_a_caption_follows_its_table() -> None:
     text = str(table)
     assert text.index("First") < text.index("What ok means.") < text.rindex("a row")
     assert "<p>What ok means.</p>" in table._repr_html_()
+
+
+def test_a_table_with_arrays_equals_its_copy_and_no_other() -> None:
+    """Arrays have no single answer to `==`."""
+    verdict, other = (bd.gate("convbeers-xs", patches=2, seed=seed) for seed in (0, 1))
+    assert verdict == deepcopy(verdict)
+    assert verdict != other
+    image = Bench(dn=np.zeros((2, 3)))
+    assert image == deepcopy(image)
