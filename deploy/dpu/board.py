@@ -1,7 +1,7 @@
 """One build of the DPU: a target profile and a configuration of it."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -78,6 +78,18 @@ class Dpu:
         }
         # A table that the target lacks is left out, because rules check which constants exist.
         return {**self.target.tables, **{name: table for name, table in sized.items() if table}}
+
+    @cached_property
+    def facts(self) -> dict[str, Mapping[str, object]]:
+        """The values that the texts of rules refer to: constants, fused activations, documents, and
+        limits derived from constants.
+        """
+        facts: dict[str, Mapping[str, object]] = {**self.tables}
+        if "channel_groups" in facts.get("array", {}):
+            facts["limits"] = {"channels": self.channels_max}
+        return facts | {
+            key: getattr(self.target, key) for key in ("activations", "documents", "npu")
+        }
 
     @property
     def cores(self) -> int:

@@ -31,15 +31,19 @@ def conv_channels(op: Operation, dpu: Dpu) -> Finding | None:
 
 def conv_padding(op: Operation, dpu: Dpu) -> Finding | None:
     """Padding on each side is 0 to (kernel - 1) * dilation ({documents[operators]}, conv2d)."""
-    window = op.window
-    # ONNX lists the pads of top and left first, then those of bottom and right.
-    room = [(k - 1) * d for k, d in zip(op.kernel, window.dilations, strict=True)] * 2
-    if all(0 <= pad <= most for pad, most in zip(window.pads, room, strict=True)):
-        return None
+    room = tuple((k - 1) * d for k, d in zip(op.kernel, op.window.dilations, strict=True))
     remedy = (
         "pad at most (kernel - 1) * dilation here and the rest with a Pad node of constant mode"
     )
-    return Finding(f"pads {window.pads} exceed {tuple(room)}, (kernel - 1) * dilation", remedy)
+    return _padding(op, room, f"{room * 2}, (kernel - 1) * dilation", remedy)
+
+
+def _padding(op: Operation, room: tuple[int, ...], most: str, remedy: str) -> Finding | None:
+    """Return a finding if a pad exceeds `room`, down and across; `most` names it in the reason."""
+    # ONNX lists the pads of top and left first, then those of bottom and right.
+    if all(0 <= pad <= limit for pad, limit in zip(op.window.pads, room * 2, strict=True)):
+        return None
+    return Finding(f"pads {op.window.pads} exceed {most}", remedy)
 
 
 def conv_weight_bank(op: Operation, dpu: Dpu) -> Finding | None:
@@ -51,13 +55,9 @@ def conv_weight_bank(op: Operation, dpu: Dpu) -> Finding | None:
     bias.
     """
     inputs = groups_of(op.channels[0], dpu.input_parallel)
-    depth = (
-        op.kernel_area
-        * inputs
-        * groups_of(dpu.output_parallel, dpu.whole("memory", "weight_banks"))
-    )
+    outputs = groups_of(dpu.output_parallel, dpu.whole("memory", "weight_banks"))
     # The bias lies in the same buffer.
-    depth += dpu.whole("conv", "weight_bias_depth")
+    depth = op.kernel_area * inputs * outputs + dpu.whole("conv", "weight_bias_depth")
     most = dpu.whole("memory", "weight_bank_depth")
     if depth <= most:
         return None
@@ -96,16 +96,14 @@ def conv_area(op: Operation, dpu: Dpu) -> Finding | None:
 
 def conv_dilation(op: Operation, dpu: Dpu) -> Finding | None:
     """Dilation * input channels is at most {limits[channels]} ({documents[operators]}, conv2d)."""
-    size = max(op.window.dilations) * op.channels[0]
+    dilation = max(op.window.dilations)
+    channels = op.channels[0]
     most = dpu.channels_max
     # Without dilation this is the rule of channels, which `conv_channels` reports.
-    if max(op.window.dilations) == 1 or size <= most:
+    if dilation == 1 or dilation * channels <= most:
         return None
-    remedy = f"use a dilation of at most {most // op.channels[0]}, or fewer input channels"
-    return Finding(
-        f"dilation {max(op.window.dilations)} * {op.channels[0]} input channels exceeds {most}",
-        remedy,
-    )
+    remedy = f"use a dilation of at most {most // channels}, or fewer input channels"
+    return Finding(f"dilation {dilation} * {channels} input channels exceeds {most}", remedy)
 
 
 def conv_groups(op: Operation, dpu: Dpu) -> Finding | None:
@@ -162,7 +160,7 @@ def transposed_kernel(op: Operation, dpu: Dpu) -> Finding | None:
     ratios = (*map(floordiv, op.kernel, strides), *map(groups_of, op.kernel, strides))
     if not outside(ratios, limit):
         return None
-    sides = f"kernel ({shown(op.kernel)}) / stride ({shown(op.window.strides)})"
+    sides = f"kernel ({shown(op.kernel)}) / stride ({shown(strides)})"
     remedy = "use a kernel at least as large as the stride, such as 4 x 4 with stride 2"
     return Finding(f"{sides} is not in the DPU's range {limit}", remedy)
 
@@ -182,11 +180,8 @@ def transposed_padding(op: Operation, dpu: Dpu) -> Finding | None:
     """Padding on each side is 0 to the kernel's side ({documents[operators]},
     transposed-conv2d).
     """
-    room = op.kernel * 2
-    if all(0 <= pad <= most for pad, most in zip(op.window.pads, room, strict=True)):
-        return None
-    reason = f"pads {op.window.pads} exceed the kernel ({shown(op.kernel)})"
-    return Finding(reason, "pad less, and crop on the host")
+    most = f"the kernel ({shown(op.kernel)})"
+    return _padding(op, op.kernel, most, "pad less, and crop on the host")
 
 
 def transposed_channels(op: Operation, dpu: Dpu) -> Finding | None:

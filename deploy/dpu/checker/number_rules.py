@@ -92,15 +92,13 @@ def shift_bias(op: Operation, dpu: Dpu) -> Finding | None:
 
     And at least min(0, shift_cut + 8 - {numbers[accumulator_bits]}).
     """
-    product = product_frac_bits(op)
     cut = _cut(op)
-    bias = _frac_bits(op, "bias")
-    if product is None or cut is None or bias is None:
+    shift = _difference(product_frac_bits(op), op, "bias")
+    if cut is None or shift is None:
         return None
     # The vendor writes it as min(0, -(24 - (8 + shift_cut))).
     low = min(0, cut + 8 - dpu.whole("numbers", "accumulator_bits"))
     high = dpu.whole("numbers", "shift_bias_max")
-    shift = product - bias
     if low <= shift <= high:
         return None
     return Finding(f"shift_bias {shift}, allowed {low} to {high}", MOVE)
@@ -110,15 +108,14 @@ def bias_width(op: Operation, dpu: Dpu) -> Finding | None:
     """A bias shifted to the products' scale fits {numbers[bias_bits]} bits
     ({numbers[bias_bits].source}).
     """
-    product = product_frac_bits(op)
-    frac_bits = _frac_bits(op, "bias")
+    shift = _difference(product_frac_bits(op), op, "bias")
     values = op.constants.get("bias")
-    if product is None or frac_bits is None or values is None:
+    if shift is None or values is None:
         return None
     # In float64, because the magnitude of the lowest integer does not fit its own type.
     largest = np.abs(values.astype(np.float64)).max(initial=0)
     most = 2 ** (dpu.whole("numbers", "bias_bits") - 1) - 1
-    size = largest * 2.0 ** (product - frac_bits)
+    size = largest * 2.0**shift
     if size <= most:
         return None
     remedy = "train with smaller biases, or with larger weights behind a smaller scale"
@@ -137,7 +134,7 @@ def shift_write(op: Operation, dpu: Dpu) -> Finding | None:
     """An add's coarsest input - output fractional bits: {numbers[shift_write]}
     ({documents[quantiser]}).
     """
-    return _shift(_difference(min(_inputs(op), default=None), op), dpu, "shift_write")
+    return _shift(_difference(min(_inputs(op), default=None), op, "output"), dpu, "shift_write")
 
 
 def same_scale(op: Operation, dpu: Dpu) -> Finding | None:
@@ -181,13 +178,13 @@ def _inputs(op: Operation) -> list[int]:
 
 
 def _cut(op: Operation) -> int | None:
-    return _difference(product_frac_bits(op), op)
+    return _difference(product_frac_bits(op), op, "output")
 
 
-def _difference(frac_bits: int | None, op: Operation) -> int | None:
-    """Return the number of fractional bits that the output of an operation has less."""
-    output = _frac_bits(op, "output")
-    return None if frac_bits is None or output is None else frac_bits - output
+def _difference(frac_bits: int | None, op: Operation, role: str) -> int | None:
+    """Return the number of fractional bits that a tensor of an operation has less."""
+    own = _frac_bits(op, role)
+    return None if frac_bits is None or own is None else frac_bits - own
 
 
 def _shift(shift: int | None, dpu: Dpu, key: str) -> Finding | None:

@@ -10,6 +10,7 @@ board's name.
 import inspect
 import math
 import re
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -133,11 +134,10 @@ def judge(op: Operation, dpu: Dpu, quantized: bool) -> tuple[Broken, ...]:
         # The results of these two kinds are no numbers of 8 bits.
         if quantized and form.kind not in ("other", "argmax"):
             rules += NUMBERS + SHIFTS.get(form.kind, ())
-        findings = ((rule, rule(form, dpu)) for rule in rules if applies(rule, dpu))
         broken = (
             Broken(rule_name(rule), rule_text(rule, dpu), finding)
-            for rule, finding in findings
-            if finding
+            for rule in rules
+            if applies(rule, dpu) and (finding := rule(form, dpu))
         )
         breaches.append(tuple(broken))
     # The first form is the operation as the file has it: the report is about that one.
@@ -194,12 +194,12 @@ def require_known(dpu: Dpu) -> None:
 
     A misspelt constant would silently disable the rule that it is meant for.
     """
-    keys: dict[str, set[str]] = {}
+    keys = defaultdict[str, set[str]](set)
     for rule in all_rules():
         for table, key in _named(rule):
-            keys.setdefault(table, set()).add(key)
+            keys[table].add(key)
     for table in keys.keys() - set(SIZED):
-        check_keys(f"{dpu.target.name} [{table}]", dpu.tables.get(table, {}), set(), keys[table])
+        check_keys(f"{dpu.target.name} [{table}]", dpu.tables.get(table, {}), (), keys[table])
 
 
 def rule_name(rule: Callable[..., object]) -> str:
@@ -213,25 +213,14 @@ def applies(rule: Callable[..., object], dpu: Dpu) -> bool:
     A rule's docstring names constants, such as {conv[kernel]}. It holds on the devices whose board
     file defines all of them; otherwise it is a rule of other DPUs.
     """
-    facts = _facts(dpu)
-    return all(key in facts.get(table, {}) for table, key in _named(rule))
+    return all(key in dpu.facts.get(table, {}) for table, key in _named(rule))
 
 
 def rule_text(rule: Callable[..., object], dpu: Dpu) -> str:
     """Return the text of a rule or a remark: its docstring, in which the limits and documents of
     the device's board are filled in.
     """
-    return _template(rule).format(**_facts(dpu))
-
-
-def _facts(dpu: Dpu) -> Mapping[str, Mapping[str, object]]:
-    """Return the values that texts refer to: constants, fused activations, documents, and limits
-    derived from constants.
-    """
-    facts: dict[str, Mapping[str, object]] = {**dpu.tables}
-    if "channel_groups" in facts.get("array", {}):
-        facts["limits"] = {"channels": dpu.channels_max}
-    return facts | {key: getattr(dpu.target, key) for key in ("activations", "documents", "npu")}
+    return _template(rule).format(**dpu.facts)
 
 
 @cache

@@ -4,13 +4,12 @@ For an NPU, AMD publishes a table of operators, Y or N/A, and no limits. The dev
 then follows from that table: it was not verified with the compiler.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import asdict, dataclass
 
 import onnx
 
 from beers_deploy.dpu.board import Dpu, device_of
-from beers_deploy.dpu.checker.finding import Finding
 from beers_deploy.dpu.checker.placement import PlacedNode, Placement, place
 from beers_deploy.dpu.checker.remarks import is_island, remarks_on
 from beers_deploy.dpu.reading import network_of, usual_tile_px
@@ -106,21 +105,28 @@ def check_network(
     sized = network_of(core, tile_px, source.label)
     placement = place(sized, build)
     npu = bool(target.npu)
-    checks = [legality(placement, npu=npu), *(_file_checks(source.model, build) if npu else [])]
+    quantized = is_quantized(source.model)
+    # A float file or a host's file is not for a compiler.
+    for_compiler = quantized and KEY not in metadata(source.model)
+    rows = _rows(placement, build, tile_px)
+    checks = [legality(placement, npu=npu)]
+    if for_compiler:
+        rows += _profile_rows(source.model)
+        checks += _file_checks(source.model, build) if npu else []
     results = [op.out_shape for op in sized.operations if op.output in sized.outputs]
     # A result of unknown shape may be an image.
     makes_image = bool(results) and all(shape is None or min(shape[1:]) > 1 for shape in results)
-    if makes_image and not is_quantized(source.model):
+    if makes_image and not quantized:
         reason = _refusal(source.model)
         checks.append(Check(ACCEPTED, int(bool(reason)), 0, "network", detail=reason))
     # A quantised file whose numbers nobody reads here is placed as if it were in float.
-    note = OTHERS_NOTE if placement.note and is_quantized(source.model) else placement.note
+    note = OTHERS_NOTE if placement.note and quantized else placement.note
     return Checked(
         title=f"{source.input.name} on {target.name} {build.name}, tile {tile_px}",
         command="check",
         arguments={"target": target.name, "dpu": build.name, "tile": tile_px},
         inputs=(source.input,),
-        rows=(*_rows(placement, build, tile_px), *_profile_rows(source.model)),
+        rows=tuple(rows),
         checks=tuple(checks),
         notes=tuple(filter(None, [note])),
         headings=HEADINGS,
@@ -160,38 +166,37 @@ def _refusal(model: onnx.ModelProto) -> str:
 
 def _rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:
     """Return all rows: devices, refusals, nodes, subgraphs, crossing tensors, remarks, counts."""
-    npu = dpu.target.npu
-    nodes = [*_device_rows(placement, dpu), *_refusal_rows(placement)]
+    rows = [*_device_rows(placement, dpu), *_refusal_rows(placement)]
     for node in placement.nodes:
-        nodes += _node_rows(node, placement, dpu)
-    texts = remarks_on(placement, dpu, tile_px)
-    remarks = [Row("remarks", name, {}, {"remark": text}) for name, text in texts.items()]
-    refusals = {"nodes refused": _count(len(placement.failed), "node")}
+        rows += _node_rows(node, placement, dpu)
+    counts = {"nodes refused": _count(len(placement.failed), "node")}
     # It is not known into which parts an NPU's compiler cuts a network.
-    if npu:
-        return [*nodes, *remarks, Row("summary", "placement", refusals)]
-    parts = {"DPU subgraphs": _count(placement.dpu_subgraphs, "subgraph")}
-    summary = Row("summary", "placement", parts | refusals)
-    cuts = []
+    if not dpu.target.npu:
+        rows += _part_rows(placement)
+        counts = {"DPU subgraphs": _count(placement.dpu_subgraphs, "subgraph")} | counts
+    texts = remarks_on(placement, dpu, tile_px)
+    rows += [Row("remarks", name, {}, {"remark": text}) for name, text in texts.items()]
+    return [*rows, Row("summary", "placement", counts)]
+
+
+def _part_rows(placement: Placement) -> list[Row]:
+    """Return a row for each subgraph, then for each tensor that crosses between two devices."""
+    members_of = defaultdict[int, list[PlacedNode]](list)
+    for node in placement.nodes:
+        members_of[node.subgraph].append(node)
+    rows = []
+    for number, members in members_of.items():
+        first, *_ = members
+        words = {"device": first.device, "first": first.op.name, "last": members[-1].op.name}
+        figures = {"nodes": _count(len(members), "node")}
+        rows.append(Row("subgraphs", f"subgraph {number}", figures, words))
     for cut in placement.cuts:
         size = unavailable("byte/image", "its shape is unknown")
         if cut.size_bytes is not None:
             size = _count(cut.size_bytes, "byte/image")
         words = {"direction": "onto the DPU" if cut.onto_dpu else "off the DPU"}
-        cuts.append(Row("cuts", cut.tensor, {"size": size}, words))
-    members_of: dict[int, list[PlacedNode]] = {}
-    for node in placement.nodes:
-        members_of.setdefault(node.subgraph, []).append(node)
-    subgraphs = []
-    for number, members in members_of.items():
-        words = {
-            "device": members[0].device,
-            "first": members[0].op.name,
-            "last": members[-1].op.name,
-        }
-        figures = {"nodes": _count(len(members), "node")}
-        subgraphs.append(Row("subgraphs", f"subgraph {number}", figures, words))
-    return [*nodes, *subgraphs, *cuts, *remarks, summary]
+        rows.append(Row("cuts", cut.tensor, {"size": size}, words))
+    return rows
 
 
 def legality(placement: Placement, *, npu: bool = False) -> Check:
@@ -208,15 +213,8 @@ def legality(placement: Placement, *, npu: bool = False) -> Check:
     return Check(name, len(failed), 0, "node", detail=first)
 
 
-def _is_for_a_board(model: onnx.ModelProto) -> bool:
-    """Return True if the file is for a compiler. A float file or a host's file is not."""
-    return is_quantized(model) and KEY not in metadata(model)
-
-
 def _profile_rows(model: onnx.ModelProto) -> list[Row]:
     """Return a row for each rule of the safety-related profile about a board's file."""
-    if not _is_for_a_board(model):
-        return []
     return [
         Row("profile", rule, {"count": _count(len(names), "place")}, {"first": "".join(names[:1])})
         for rule, names in implicit_parts(model).items()
@@ -224,11 +222,7 @@ def _profile_rows(model: onnx.ModelProto) -> list[Row]:
 
 
 def _file_checks(model: onnx.ModelProto, dpu: Dpu) -> list[Check]:
-    """Return the checks of a VINT8 file as a whole. There are none for a float file or a host's,
-    because these are not for a compiler.
-    """
-    if not _is_for_a_board(model):
-        return []
+    """Return the checks of a VINT8 file as a whole."""
     # ONNX allows both names for its own domain.
     opset = max(entry.version for entry in model.opset_import if entry.domain in ("", "ai.onnx"))
     most = dpu.limit("file", "opset_max")
@@ -244,9 +238,9 @@ def _file_checks(model: onnx.ModelProto, dpu: Dpu) -> list[Check]:
 
 def _device_rows(placement: Placement, dpu: Dpu) -> list[Row]:
     """Return a row for each device: the number of nodes that it runs, and their operators."""
-    operators: dict[str, Counter[str]] = {}
+    operators = defaultdict[str, Counter[str]](Counter)
     for node in placement.nodes:
-        operators.setdefault(_device(node, placement, dpu), Counter())[node.op.op_type] += 1
+        operators[_device(node, placement, dpu)][node.op.op_type] += 1
     rows = []
     for device, counts in operators.items():
         words = ", ".join(f"{name} {count}" for name, count in counts.most_common())
@@ -257,16 +251,17 @@ def _device_rows(placement: Placement, dpu: Dpu) -> list[Row]:
 
 def _refusal_rows(placement: Placement) -> list[Row]:
     """Return a row for each broken rule: the number of nodes, the first one, and a remedy."""
-    broken: dict[str, list[tuple[PlacedNode, Finding]]] = {}
+    counts = Counter[str]()
+    words: dict[str, dict[str, str]] = {}
     for node in placement.failed:
         for breach in node.broken:
-            broken.setdefault(breach.text, []).append((node, breach.finding))
-    rows = []
-    for rule, breaches in broken.items():
-        node, finding = breaches[0]
-        words = {"first": f"{node.op.name}: {finding.reason}", "remedy": finding.remedy}
-        rows.append(Row("refusals", rule, {"count": _count(len(breaches), "node")}, words))
-    return rows
+            counts[breach.text] += 1
+            first = f"{node.op.name}: {breach.finding.reason}"
+            words.setdefault(breach.text, {"first": first, "remedy": breach.finding.remedy})
+    return [
+        Row("refusals", rule, {"count": _count(count, "node")}, words[rule])
+        for rule, count in counts.items()
+    ]
 
 
 def _node_rows(node: PlacedNode, placement: Placement, dpu: Dpu) -> list[Row]:
@@ -275,13 +270,8 @@ def _node_rows(node: PlacedNode, placement: Placement, dpu: Dpu) -> list[Row]:
         "part": node.part.removeprefix("dpu-") if dpu.target.npu else node.part,
         "device": _device(node, placement, dpu),
     }
-    if not node.broken:
-        return [Row("nodes", node.op.name, {}, words)]
-    rows = []
-    for breach in node.broken:
-        why = {"rule": breach.text, **asdict(breach.finding)}
-        rows.append(Row("nodes", node.op.name, {}, words | why))
-    return rows
+    whys = [{"rule": breach.text, **asdict(breach.finding)} for breach in node.broken]
+    return [Row("nodes", node.op.name, {}, words | why) for why in whys or [{}]]
 
 
 def _device(node: PlacedNode, placement: Placement, dpu: Dpu) -> str:

@@ -90,7 +90,7 @@ def placed_work(placement: Placement, task: Task) -> Array:
     channels = {
         node.op.out_shape[0]
         for node in placement.nodes
-        if node.op.out_shape is not None and not back.isdisjoint(node.op.outputs)
+        if node.op.out_shape and not back.isdisjoint(node.op.outputs)
     }
     # Maps with different numbers of channels are read completely.
     count = channels.pop() if len(channels) == 1 else 1
@@ -162,22 +162,19 @@ def refused_interval_s(operations: Sequence[Operation], dpu: Dpu) -> Interval:
     Returns:
         The shortest and the longest time in s, for one image on all cores together.
     """
-    if not operations:
-        return 0.0, 0.0
-    times = []
+    low_s = high_s = 0.0
     for op in operations:
-        values = op.out_bytes + sum(math.prod(shape) for shape in op.in_shapes if shape is not None)
-        moved_values = values + op.weight_bytes
-        times.append(_plain_work_s(op.operations, moved_values, op.out_bytes, dpu))
-    low_s, high_s = (
-        math.fsum(ends) / dpu.whole("cpu", "cores") for ends in zip(*times, strict=True)
-    )
+        read_values = sum(math.prod(shape) for shape in op.in_shapes if shape is not None)
+        moved_values = op.out_bytes + read_values + op.weight_bytes
+        least_s, most_s = _plain_work_s(op.operations, moved_values, op.out_bytes, dpu)
+        low_s += least_s
+        high_s += most_s
     return low_s, high_s
 
 
 def _plain_work_s(operations: float, moved_values: float, results: float, dpu: Dpu) -> Interval:
-    """Return the shortest and the longest time of one core for float32 work: by a good library, and
-    by plain code.
+    """Return the shortest and the longest time of all cores together for float32 work: by a good
+    library, and by plain code.
     """
     keys = ("clock_ghz", "product_flops_per_cycle", "moved_bytes_per_s", "decoding_mips_per_ghz")
     clock, products, bandwidth, decoding = (dpu.limit("cpu", key) for key in keys)
@@ -186,7 +183,8 @@ def _plain_work_s(operations: float, moved_values: float, results: float, dpu: D
     least_s = max(operations / (1e9 * clock.high * products.high), moved_bytes / bandwidth.high)
     instructions = INSTRUCTIONS * results + PRODUCT_INSTRUCTIONS * operations
     most_s = instructions / (1e6 * decoding.low * clock.low) + moved_bytes / bandwidth.low
-    return least_s, most_s
+    cores = dpu.whole("cpu", "cores")
+    return least_s / cores, most_s / cores
 
 
 FLOAT_OPERATIONS = {"nearest": 1.0, "linear": 6.0, "cubic": 14.0, "Sigmoid": 20.0, "Tanh": 20.0}
@@ -220,19 +218,17 @@ def float_interval_s(placement: Placement, task: Task, work: FloatWork, dpu: Dpu
         The shortest and the longest time in s, for one image on all cores together.
     """
     _, back = _crossing_bytes(placement)
-    values = dict.fromkeys(work.kinds, back / work.copies)
+    values = [(kind, back / work.copies) for kind in work.kinds]
     for node in placement.nodes:
         if task == "image" and node.part != "dpu-core":
             kind = node.op.op_type
             if kind == "Resize":
                 kind = str(node.op.attributes.get("mode", "nearest"))
             if kind in FLOAT_OPERATIONS:
-                values[kind] = values.get(kind, 0) + node.op.out_bytes
-    operations = sum(FLOAT_OPERATIONS[kind] * count for kind, count in values.items())
-    results = sum(values.values())
-    low_s, high_s = _plain_work_s(operations, 2 * results, results, dpu)
-    cores = dpu.whole("cpu", "cores")
-    return low_s / cores, high_s / cores
+                values.append((kind, node.op.out_bytes))
+    operations = sum(FLOAT_OPERATIONS[kind] * count for kind, count in values)
+    results = sum(count for _, count in values)
+    return _plain_work_s(operations, 2 * results, results, dpu)
 
 
 def consistency_interval_s(pixels: float, dpu: Dpu) -> Interval:
@@ -250,6 +246,4 @@ def consistency_interval_s(pixels: float, dpu: Dpu) -> Interval:
         The shortest and the longest time in s, on all cores together.
     """
     # A product with its sum counts as two operations.
-    low_s, high_s = _plain_work_s(2 * PRODUCTS_PER_PX * pixels, 3 * pixels, pixels, dpu)
-    cores = dpu.whole("cpu", "cores")
-    return low_s / cores, high_s / cores
+    return _plain_work_s(2 * PRODUCTS_PER_PX * pixels, 3 * pixels, pixels, dpu)

@@ -72,5 +72,5 @@ def correction(of: Levels, runs: Sequence[tuple[Levels, float]]) -> tuple[float,
 
 
 def _common(one: Levels, other: Levels) -> float:
-    same = (a == b for a, b in zip(one, other, strict=True))
-    return math.fsum(share for share, equal in zip(SHARES, same, strict=True) if equal)
+    pairs = zip(SHARES, one, other, strict=True)
+    return math.fsum(share for share, a, b in pairs if a == b)

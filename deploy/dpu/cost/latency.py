@@ -231,8 +231,8 @@ def predict(
     Raises:
         ModelError: the DPU refuses a node inside the core, or the network has no convolution.
     """
-    if placement.cutting:
-        names = ", ".join(node.op.name for node in placement.cutting[:3])
+    if cutting := placement.cutting:
+        names = ", ".join(node.op.name for node in cutting[:3])
         raise ModelError(
             "The cost model needs a core that runs on the DPU as a whole, but the DPU refuses "
             f"{printable(names)}. Run 'beers-deploy check' for the reasons and remedies."
@@ -247,24 +247,21 @@ def predict(
         )
     columns = Layers.of(works, dpu)
     parts_s = columns.parts_s(constants, structure)
-    times_s = columns.time_s(constants, structure)
+    times_s = parts_s.sum(axis=1)
     refused = [node.op for node in placement.failed]
     task = task or task_of(placement)
-    parts_of_host_s = (
-        refused_interval_s(refused, dpu),
-        float_interval_s(placement, task, float_work, dpu),
-    )
-    refused_s = (sum(low for low, _ in parts_of_host_s), sum(high for _, high in parts_of_host_s))
-    step_s = consistency_interval_s(step_px, dpu) if step_px else (0.0, 0.0)
+    by_nodes_s = refused_interval_s(refused, dpu)
+    in_float_s = float_interval_s(placement, task, float_work, dpu)
+    refused_s = (by_nodes_s[0] + in_float_s[0], by_nodes_s[1] + in_float_s[1])
+    step_s = consistency_interval_s(step_px, dpu)
     host_parts = host_parts_s(placed_work(placement, task)[None], constants)
     host_parts /= dpu.whole("cpu", "cores")
     # Work that no rate is published for is taken at the geometric mean of its two ends.
     host_parts[0, 0] += between(refused_s) + between(step_s)
     host_s = float(host_parts.sum())
-    shares = shares_of(
-        parts_s.sum(axis=0)[None] / dpu.batch, host_parts, structure.contention_exponent
-    )
-    width = float(shares[0] @ [dpu.value("cost", WIDTHS[part]) for part in PARTS])
+    dpu_parts = parts_s.sum(axis=0)[None] / dpu.batch
+    (shares,) = shares_of(dpu_parts, host_parts, structure.contention_exponent)
+    width = float(shares @ [dpu.value("cost", WIDTHS[part]) for part in PARTS])
     outside = _outside(placement.core, dpu)
     if outside:
         width = max(width, dpu.value("cost", WIDTHS["outside"]))
@@ -306,14 +303,12 @@ def _outside(core: Sequence[Operation], dpu: Dpu) -> tuple[str, ...]:
     """
     operations = sum(op.operations for op in core)
     values = (
-        ("map_bytes", "largest map", largest_map_bytes(core), 1e-6, "MB"),
-        ("operations", "work", operations, 1e-9, "GOP"),
+        ("fitted_map_bytes", "largest map", largest_map_bytes(core), 1e-6, "MB"),
+        ("fitted_operations", "work", operations, 1e-9, "GOP"),
     )
     sentences = []
     for key, name, value, scale, unit in values:
-        most = dpu.limit("cost", f"fitted_{key}").high
-        # The ends of the fitted range are rounded in the file: the largest fitted network lies
-        # inside.
+        most = dpu.limit("cost", key).high
         if value > most * (1 + ROUNDED):
             sentences.append(f"{name} {scale * value:.3g} {unit} (fitted up to {scale * most:.3g})")
     return tuple(sentences)

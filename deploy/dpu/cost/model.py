@@ -160,8 +160,8 @@ class Layers:
             )
             for work in works
         ]
-        # The shape also keeps the ten fields of a network without layers.
-        return cls(*np.array(rows, dtype=np.float64).reshape(-1, 10).T)
+        # The shape also keeps the fields of a network without layers.
+        return cls(*np.array(rows, dtype=np.float64).reshape(-1, len(fields(cls))).T)
 
     def compute_s(self, constants: Constants) -> Array:
         """Return the time in s that each layer computes for a batch, shape (n,).
@@ -243,9 +243,8 @@ def shares_of(dpu_s: Array, host_s: Array, contention_exponent: float) -> Array:
         contention_exponent: exponent of `frame_rate`.
     """
     dpu, host = (times.sum(axis=1, keepdims=True) for times in (dpu_s, host_s))
-    follows_host = host**contention_exponent / (
-        host**contention_exponent + dpu**contention_exponent
-    )
+    q = contention_exponent
+    follows_host = host**q / (host**q + dpu**q)
     # Published rates of the DPU alone include no time of the host.
     host_shares = np.divide(host_s, host, out=np.zeros_like(host_s), where=host > 0)
     parts = [(1 - follows_host) * dpu_s / dpu, follows_host * host_shares]
@@ -264,10 +263,9 @@ def frame_rate(dpu_s: float, host_s: float, contention_exponent: float) -> float
     """
     longer = max(dpu_s, host_s)
     shorter = min(dpu_s, host_s)
+    q = contention_exponent
     # (dpu^q + host^q)^(1/q), divided by the longer time so that no power overflows.
-    return float(
-        1 / (longer * (1 + (shorter / longer) ** contention_exponent) ** (1 / contention_exponent))
-    )
+    return float(1 / (longer * (1 + (shorter / longer) ** q) ** (1 / q)))
 
 
 def between(interval: Interval) -> float:
