@@ -55,9 +55,9 @@ CASES: list[tuple[tuple[str, ...], str, str, str, int]] = [
     (
         ZYNQ,
         "conv weight bank",
-        "y = Conv<pads=[2,2,2,2]>(x, w8x1312x5x5)",
-        "a = Conv(x, w1296x1312x1x1) y = Conv<pads=[2,2,2,2]>(a, w8x1296x5x5)",
-        1312,
+        "y = Conv<pads=[3,3,3,3]>(x, w8x672x7x7)",
+        "a = Conv(x, w656x672x1x1) y = Conv<pads=[3,3,3,3]>(a, w8x656x7x7)",
+        672,
     ),
     (
         (*ZYNQ, "vek280"),

@@ -166,7 +166,7 @@ def test_each_rule_refuses_its_case_alone_and_following_the_remedy_passes(rule: 
             "y = Conv<pads=[2,2,3,3]>(image, w8x2049x6x6)",
             2049,
         ),
-        (["conv weight bank"], "y = Conv<pads=[2,2,3,3]>(image, w2049x2048x6x6)", 2048),
+        ([], "y = Conv<pads=[2,2,3,3]>(image, w2049x8x6x6)", 8),
         (["conv weight bank"], "y = Conv<pads=[3,3,3,3]>(image, w1x2048x8x8)", 2048),
         (["transposed channels"], "y = ConvTranspose(image, w8x4097x1x1)", 8),
         (

@@ -121,6 +121,7 @@ def test_the_first_line_warns_if_other_programs_load_the_machine(
     network: Path, monkeypatch: pytest.MonkeyPatch, others: float, warned: bool
 ) -> None:
     monkeypatch.setattr(traditional, "load_of_others", lambda *_: others)
+    monkeypatch.setattr(traditional, "CROP_PX", 48)
     result = bench(network, traditional=True)
     heading = result.headings[result.rows[0].table]
     assert ("other programs took 50%" in heading) is warned
