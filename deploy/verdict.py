@@ -35,7 +35,7 @@ from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.profiles.toml import read_json
 from beers_deploy.quant.encodings import as_on_board
 from beers_deploy.quant.float_parts import float_note
-from beers_deploy.quant.gate import GateResult, unfit_reference
+from beers_deploy.quant.gate import unfit_reference
 from beers_deploy.quant.limits import Limits, judge, not_judged
 from beers_deploy.quant.onnx_file import faults_named
 from beers_deploy.quant.samples.own import OwnSamples
@@ -316,7 +316,14 @@ def judged(
     # Without this, the file that is judged would decide if its encoding is checked.
     must_describe = baseline is not None and ENCODING in baseline.checks
     checks += file_checks(comparison.floating.model, comparison.int8, target, must_describe)
-    notes = [*comparison.notes, *_mae_note(result, limits, checks)]
+    notes = list(comparison.notes)
+    mae_failed = any(check.name == "MAE" and not check.passed for check in checks)
+    if mae_failed and limits.mae == Limits().mae and result.input_change > LITTLE_CHANGE:
+        notes.append(
+            f"the MAE limit of {limits.mae:g} suits networks that change their input little "
+            "(ConvBEERS by 0.008 of full scale), and this one changes it more: choose `max_mae` "
+            "for this network, and look at the PSNR drop"
+        )
     notes += float_note(comparison.int8.model)
     notes += not_judged(result, limits)
     if not any(check.name == ENCODING for check in checks):
@@ -335,21 +342,6 @@ def judged(
         headings=comparison.headings,
         comparison=comparison,
     )
-
-
-def _mae_note(result: GateResult, limits: Limits, checks: Sequence[Check]) -> list[str]:
-    """Return a note if the MAE exceeded its default limit and that limit does not suit the
-    network.
-    """
-    broken = any(check.name == "MAE" and not check.passed for check in checks)
-    if not broken or limits.mae != Limits().mae or result.input_change <= LITTLE_CHANGE:
-        return []
-    note = (
-        f"the MAE limit of {limits.mae:g} suits networks that change their input little "
-        "(ConvBEERS by 0.008 of full scale), and this one changes it more: choose `max_mae` for "
-        "this network, and look at the PSNR drop"
-    )
-    return [note]
 
 
 def file_checks(

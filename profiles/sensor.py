@@ -7,6 +7,7 @@ it.
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import field
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -114,7 +115,8 @@ class Sensor:
     @model_validator(mode="after")
     def _is_possible(self) -> Self:
         """Raise ValueError if no instrument can have these numbers."""
-        require_possible_noise(self._radiances, (self.snr_0, self.snr_1), (self.alpha, self.beta))
+        radiances = self.radiance_0, self.radiance_1
+        require_possible_noise(radiances, (self.snr_0, self.snr_1), (self.alpha, self.beta))
         require_possible_blur(self.contrasts, self.response, self.effects)
         _, bits, offset_dn = self.units
         require_possible_offset(int(bits), offset_dn)
@@ -167,20 +169,20 @@ class Sensor:
         for key, table in TABLE_OF.items():
             if constant := getattr(self, key):
                 tables[table][key] = constant
-        if isinstance(self.response, MtfTable):
-            curve = self.response
+        across, along = self.contrasts
+        blur = self.response
+        if isinstance(blur, MtfTable):
             tables["mtf"] = {
-                "frequency": curve.frequency,
-                "across": _stated(curve.across, self.contrasts[0]),
-                "along": _stated(curve.along, self.contrasts[1]),
+                "frequency": blur.frequency,
+                "across": _stated(blur.across, across),
+                "along": _stated(blur.along, along),
             }
-        elif self.response:
+        elif blur:
             samples = path.with_name(f"{path.stem}-psf.npy")
-            point = self.response
-            np.save(samples, unpacked(point).astype(np.float32))
+            np.save(samples, unpacked(blur).astype(np.float32))
             tables["mtf"] = {
-                "psf": _stated(samples.name, self.mtf_nyquist),
-                "psf_samples_per_px": point.samples_per_px,
+                "psf": _stated(samples.name, across),
+                "psf_samples_per_px": blur.samples_per_px,
             }
         text = sensor_toml(self.description, {**tables, **self.effects})
         path.write_text(text, encoding="utf-8")
@@ -220,9 +222,7 @@ class Sensor:
     def with_fields(self, **fields: object) -> "Sensor":
         """Return this sensor with other fields, or raise ProfileError if they are invalid."""
         # A measured sensor has a table too, which does not hold for other numbers.
-        own = {
-            key: value for key, value in vars(self).items() if key in Sensor.__dataclass_fields__
-        }
+        own = {key: getattr(self, key) for key in Sensor.__dataclass_fields__}
         return validated(Sensor, {**own, **fields}, f"sensor {self.name}", GROUPS)
 
     @property
@@ -255,17 +255,12 @@ class Sensor:
         return np.sqrt(np.maximum(alpha * np.asarray(radiance, np.float64) + beta, 0.0))
 
     def __repr__(self) -> str:
-        across = self.mtf_nyquist
-        noise = (
-            f"SNR {self.snr_1} at {self.radiance_1} W/m2/sr/um"
-            if self.snr_1
-            else "noise by alpha and beta"
-        )
-        more = f", {', '.join(self.effects)}" if self.effects else ""
-        return (
-            f"Sensor({self.name!r}: {counted(int(self.bits.low), 'bit')}, MTF {across} at Nyquist, "
-            f"{noise}{more})"
-        )
+        noise = "noise by alpha and beta"
+        if self.snr_1:
+            noise = f"SNR {self.snr_1} at {self.radiance_1} W/m2/sr/um"
+        bits = counted(int(self.bits.low), "bit")
+        facts = [bits, f"MTF {self.mtf_nyquist} at Nyquist", noise, *self.effects]
+        return f"Sensor({self.name!r}: {', '.join(facts)})"
 
     @property
     def units(self) -> tuple[float, float, float]:
@@ -299,28 +294,25 @@ class Sensor:
             return float(generator.uniform(constant.low, constant.high))
 
         def parameter(constant: Constant) -> float:
-            # A number without a range draws nothing from the generator, so that later draws stay
-            # the same.
+            # A number without a range draws nothing, so that later draws stay the same.
             return number(constant) if constant.low < constant.high else constant.low
 
         mtf = number(self.mtf_nyquist)
         noise, rejected = self._draw_noise(number)
         effects = settled(self.effects, parameter)
         # Drawn last, so that a profile without it draws the same numbers as before.
-        along = self.mtf_nyquist_along
-        mtf_along = None if along is None else number(along)
-        return self._instrument(mtf, noise, effects, mtf_along), rejected
+        along = number(self.mtf_nyquist_along) if self.mtf_nyquist_along else None
+        return self._instrument(mtf, noise, effects, along), rejected
 
     def _draw_noise(self, number: Callable[[Constant], float]) -> tuple[tuple[float, float], int]:
         """Return alpha and beta, and the number of SNR pairs that were rejected."""
         if self.alpha and self.beta:
             return (number(self.alpha), number(self.beta)), 0
-        snr_0, snr_1 = self.snr_pair
         for rejected in range(MAX_DRAWS):
-            alpha, beta = self._noise(number(snr_0), number(snr_1))
-            if alpha >= 0 and beta >= 0:
-                return (alpha, beta), rejected
-        fault = impossible_snr(self._radiances, self.snr_pair)
+            noise = self._noise(*map(number, self.snr_pair))
+            if min(noise) >= 0:
+                return noise, rejected
+        fault = impossible_snr((self.radiance_0, self.radiance_1), self.snr_pair)
         raise ProfileError(f"The sensor profile {self.name} {fault}")
 
     def nominal(self) -> Instrument:
@@ -328,10 +320,10 @@ class Sensor:
 
         The SNR at `radiance_0` is moved to the nearest physically possible value.
         """
-        effects = settled(self.effects, lambda constant: constant.middle)
-        along = self.mtf_nyquist_along
-        mtf_along = None if along is None else along.middle
-        return self._instrument(self.mtf_nyquist.middle, self._middle_noise(), effects, mtf_along)
+        effects = settled(self.effects, attrgetter("middle"))
+        across, along = (contrast.middle for contrast in self.contrasts)
+        mtf_along = along if self.mtf_nyquist_along else None
+        return self._instrument(across, self._middle_noise(), effects, mtf_along)
 
     def _middle_noise(self) -> tuple[float, float]:
         """Return alpha and beta in the middle of their ranges."""
@@ -344,10 +336,6 @@ class Sensor:
 
     def _noise(self, snr_0: float, snr_1: float) -> tuple[float, float]:
         return noise_from_snr(self.radiance_0.low, snr_0, self.radiance_1.low, snr_1)
-
-    @property
-    def _radiances(self) -> tuple[Constant, Constant]:
-        return self.radiance_0, self.radiance_1
 
     @property
     def snr_pair(self) -> tuple[Constant, Constant]:

@@ -125,7 +125,7 @@ def vectors_table(folder: Path) -> Table:
     Raises:
         OptionError: the folder has no index, or a damaged one.
     """
-    digests, _ = _index(folder / INDEX)
+    digests, _ = _index(folder)
     rows = [Row("cases", case, {}, {"tensors": str(len(files))}) for case, files in digests.items()]
     return Table(title=f"golden vectors in {folder}", inputs=(folder / NETWORK,), rows=tuple(rows))
 
@@ -141,10 +141,9 @@ def _remove_older(folder: Path) -> None:
     index.unlink()
     for case in CASES:
         # A link may lead to files that are not ours.
-        if (folder / case).is_symlink():
-            continue
-        for path in ((folder / case / PICTURE), *(folder / case).glob("[0-9]*-*.npy")):
-            path.unlink(missing_ok=True)
+        if not (folder / case).is_symlink():
+            for path in (folder / case / PICTURE, *(folder / case).glob("[0-9]*-*.npy")):
+                path.unlink(missing_ok=True)
 
 
 def files_of(core: IntCore) -> dict[str, str]:
@@ -251,7 +250,7 @@ def read_golden(folder: Path) -> Golden:
         ImageError: a file is no array, or the inputs of a case are not int8 arrays of the network's
             channels.
     """
-    digests, half_even = _index(folder / INDEX)
+    digests, half_even = _index(folder)
     network = Network.load(folder / NETWORK)
     with faults_named(network.label):
         core = read_core(network.model)
@@ -302,8 +301,9 @@ def _encodes_to(planes: np.ndarray, image: np.ndarray, core: IntCore) -> bool:
 AGAIN = "Write the folder again with 'beers-deploy golden'."
 
 
-def _index(path: Path) -> tuple[dict[str, dict[str, str]], bool]:
+def _index(folder: Path) -> tuple[dict[str, dict[str, str]], bool]:
     """Return the digests of the files of each case, and True if ties were rounded to even."""
+    path = folder / INDEX
     try:
         document: Any = read_json(path)
         if (document["schema"], document["schema_version"]) != (SCHEMA, SCHEMA_VERSION):
@@ -325,12 +325,8 @@ def _planes(path: Path, core: IntCore) -> np.ndarray:
     """Read the planes that a core reads, (N, C, H, W) int8."""
     planes = read_array(path)
     channels = core.host_part.planes
-    if (
-        planes.dtype != np.int8
-        or planes.ndim != 4
-        or planes.shape[1] != channels
-        or not planes.size
-    ):
+    is_int8 = planes.dtype == np.int8 and planes.ndim == 4
+    if not is_int8 or planes.shape[1] != channels or not planes.size:
         raise ImageError(
             f"{path} must hold int8 planes of shape (N, {channels}, H, W), got {planes.dtype} of "
             f"shape {planes.shape}. {AGAIN}"

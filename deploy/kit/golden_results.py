@@ -6,6 +6,7 @@ the board can return. docs/how-to/board.md explains what a pattern usually means
 """
 
 import os
+from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -60,14 +61,15 @@ def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[st
     wrong = [name for name, errors in outputs.items() if any(error.any() for error in errors)]
     detail = ""
     if wrong:
-        detail = f"the first to differ is {_layer(golden.core, wrong[0])}"
-        needed = {wrong[0]}
+        first, *_ = wrong
+        detail = f"the first to differ is {_layer(golden.core, first)}"
+        needed = {first}
         unseen = 0
         # Go back from the last operation until every path ends at a tensor that was returned.
         for op in reversed(golden.core.ops):
-            if op.output in needed and (op.output == wrong[0] or op.output not in outputs):
+            if op.output in needed and op.output not in outputs.keys() - {first}:
                 needed |= set(op.inputs)
-                unseen += op.output != wrong[0]
+                unseen += op.output != first
         if unseen:
             detail += f", {counted(unseen, 'layer')} before it not handed out"
     return Table(
@@ -89,23 +91,22 @@ def _errors(golden: Golden, folder: Path) -> Errors:
     files = files_of(golden.core)
     paths = [path for path in folder.glob("*/*.npy") if path.name != PICTURE]
     unknown = [
-        path
+        f"{path.parent.name}/{path.name}"
         for path in paths
         if path.parent.name not in golden.cases or path.name not in files.values()
     ]
     if unknown or not paths:
-        actual = f"{unknown[0].parent.name}/{unknown[0].name}" if unknown else "none"
         raise OptionError(
-            f"The results in {folder} must be named CASE/LAYER.npy as in {INDEX}, got {actual}. "
-            "Rename them."
+            f"The results in {folder} must be named CASE/LAYER.npy as in {INDEX}, got "
+            f"{(unknown or ['none'])[0]}. Rename them."
         )
-    errors: dict[str, list[np.ndarray]] = {}
+    errors = defaultdict[str, list[np.ndarray]](list)
     for name, file in files.items():
-        for path in sorted(path for path in paths if path.name == file):
+        for path in sorted(folder.glob(f"*/{file}")):
             expected = golden.cases[path.parent.name][name]
             values = _integers(path, expected.shape, golden.core.frac_bits[name])
             # Differences of uint8 or int8 would wrap around, so the values are int16.
-            errors.setdefault(name, []).append(np.abs(values - expected))
+            errors[name].append(np.abs(values - expected))
     return errors
 
 
@@ -158,9 +159,9 @@ def where(differs: np.ndarray) -> str:
     if not differs.any():
         return ""
     height, width = differs.shape[2:]
-    channels = np.flatnonzero(differs.any((0, 2, 3)))
-    rows = np.flatnonzero(differs.any((0, 1, 3)))
-    columns = np.flatnonzero(differs.any((0, 1, 2)))
+    channels, rows, columns = (
+        np.flatnonzero(np.moveaxis(differs, axis, 0).any((1, 2, 3))) for axis in (1, 2, 3)
+    )
     within = f"{len(channels)} of {differs.shape[1]} channels"
     if len(channels) == 1:
         within = f"channel {channels[0]}"
@@ -171,12 +172,8 @@ def where(differs: np.ndarray) -> str:
         return f"within {reach_px} px of the border, in {within}"
     for name, lines, size in (("row", rows, height), ("column", columns, width)):
         if len(lines) <= size // 4:
-            return f"in {_lines(name, lines)}, in {within}"
+            span = f"{name}s {lines[0]} to {lines[-1]}"
+            if len(lines) == 1:
+                span = f"{name} {lines[0]}"
+            return f"in {span}, in {within}"
     return f"everywhere, in {within}"
-
-
-def _lines(name: str, lines: np.ndarray) -> str:
-    """Return the words for rows or columns, such as "row 9" or "rows 9 to 10"."""
-    if len(lines) == 1:
-        return f"{name} {lines[0]}"
-    return f"{name}s {lines[0]} to {lines[-1]}"

@@ -170,8 +170,7 @@ def factors(tile: np.ndarray) -> np.ndarray:
     smallest, *others = sorted(UNITS)
     choice = np.full(tile.shape[2:], smallest)
     pixels = tile[0, 0]
-    third = np.full(3, 1 / 3, F)
-    sharp = np.abs(pixels - summed(np.pad(pixels, 1, "edge"), third, third, 1))
+    sharp = np.abs(pixels - averaged(np.pad(pixels, 1, "edge"), 3, 1))
     sharpest = largest_around(sharp, S["edge_px"])
     brightest = largest_around(pixels, S["halo_px"]) - DARK
     for factor in others:
@@ -205,14 +204,13 @@ def smoothed(x: np.ndarray) -> np.ndarray:
     """
     side = S["consistency"]["window_px"]
     dark, growth, square = np.array(S["consistency"]["variances"], F)
-    window = np.full(side, 1 / side, F)
     wide = np.pad(x, side // 2 * 2, "symmetric")
-    mean = summed(wide, window, window, 1)
+    mean = averaged(wide, side, 1)
     light = np.maximum(mean - DARK, F(0))
     n = np.maximum(dark + growth * light + square * light**2, F(0))
-    variance = summed(wide * wide, window, window, 1) - mean * mean
+    variance = averaged(wide * wide, side, 1) - mean * mean
     rest = n / np.maximum(np.maximum(variance, n), F(1e-30))
-    share, mean = (summed(values, window, window, 1) for values in (rest, rest * mean))
+    share, mean = (averaged(values, side, 1) for values in (rest, rest * mean))
     return np.asarray(x - share * x + mean)
 
 
@@ -230,8 +228,9 @@ def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
     # The near part of H x is a sum of separable filters, computed for the means of blocks alone.
     near = extended(smooth, NEAR)
     blurred = sum(summed(near, row, column) for row, column in zip(rows, columns))  # noqa: B905 - as above
-    blurred = blurred + around(block_means(extended(smooth, BLOCK * (len(far) // 2))), far)
-    own = block_means(extended(raw, 0))
+    wide = extended(smooth, BLOCK * (len(far) // 2))
+    blurred = blurred + around(averaged(wide, BLOCK, BLOCK), far)
+    own = averaged(extended(raw, 0), BLOCK, BLOCK)
     # The converter clips noise at zero: that raises the means of dark blocks, and is no error.
     clipped = np.interp(own, means, excess, right=0.0).astype(F)
     residual = own - np.minimum(clipped, np.maximum(own, F(0))) - blurred
@@ -254,9 +253,9 @@ def detail(raw: np.ndarray, near: np.ndarray) -> np.ndarray:
     """
     weights = (np.array(S["consistency"]["detail"][name], F) for name in ("rows", "columns"))
     blurred = sum(summed(near, row, column, FINE) for row, column in zip(*weights))  # noqa: B905 - as above
-    residual = block_means(extended(raw, 0), FINE) - blurred
-    change = interpolated(residual, raw.shape, FINE)
-    change = change - interpolated(block_means(residual, BLOCK // FINE), raw.shape)
+    residual = averaged(extended(raw, 0), FINE, FINE) - blurred
+    large = averaged(residual, BLOCK // FINE, BLOCK // FINE)
+    change = interpolated(residual, raw.shape, FINE) - interpolated(large, raw.shape)
     for size in raw.shape:
         low, high = inner(-(-size // BLOCK))
         change[: BLOCK * low] = 0
@@ -318,10 +317,7 @@ def report(blocks: np.ndarray) -> str:
 
 def extended(x: np.ndarray, margin: int) -> np.ndarray:
     """Mirror an image (H, W) to whole blocks, and by `margin` pixels more on every side."""
-    for axis, size in enumerate(x.shape):
-        places = np.arange(-margin, -(-size // BLOCK) * BLOCK + margin) % (2 * size)
-        x = x.take(np.minimum(places, 2 * size - 1 - places), axis)
-    return x
+    return np.pad(x, [(margin, margin + -size % BLOCK) for size in x.shape], "symmetric")
 
 
 def summed(x: np.ndarray, row: np.ndarray, column: np.ndarray, side: int = BLOCK) -> np.ndarray:
@@ -332,10 +328,10 @@ def summed(x: np.ndarray, row: np.ndarray, column: np.ndarray, side: int = BLOCK
     return x
 
 
-def block_means(x: np.ndarray, side: int = BLOCK) -> np.ndarray:
-    """Compute the mean of each block of `side` pixels."""
+def averaged(x: np.ndarray, side: int, step: int) -> np.ndarray:
+    """Compute the mean of the square of `side` pixels at every `step`-th place along each axis."""
     mean = np.full(side, 1 / side, F)
-    return summed(x, mean, mean, side)
+    return summed(x, mean, mean, step)
 
 
 def around(means: np.ndarray, far: np.ndarray) -> np.ndarray:

@@ -45,24 +45,27 @@ def _opened(
 
 def _figures(samples: Samples, held_bytes: int) -> dict[str, Figure]:
     """Return the figures of the runs of a network."""
-    times_s = [time_s for time_s, _ in samples]
-    times_ms = 1e3 * np.array(times_s)
-    total_s = sum(times_s)
-    source = (
-        f"{counted(len(times_s), 'run')} in {total_s:.1f} s after one for warm-up, loading left out"
-    )
+    total_s = sum(time_s for time_s, _ in samples)
+    runs = counted(len(samples), "run")
+    source = f"{runs} in {total_s:.1f} s after one for warm-up, loading left out"
     memory = "rise of resident memory once the file was opened and had run once"
     power = next((each for _, each in samples if each.value is None), samples[0][1])
     if power.value is not None:
         # Runs differ in length: the mean power is energy over time, not the mean of the powers.
         energy_j = sum((each.value or 0.0) * time_s for time_s, each in samples)
         power = measured(energy_j / total_s, "W", power.source)
-    return {
-        "p50": measured(float(np.percentile(times_ms, 50)), "ms/tile", source),
-        "p90": measured(float(np.percentile(times_ms, 90)), "ms/tile", source),
-        "throughput": measured(len(times_s) / total_s, "frame/s", source),
+    return _percentiles(samples, source) | {
+        "throughput": measured(len(samples) / total_s, "frame/s", source),
         "power": power,
         "memory": measured(held_bytes / 1e6, "MB", memory),
+    }
+
+
+def _percentiles(samples: Samples, source: str) -> dict[str, Figure]:
+    """Return the median and the 90th percentile of the times of some runs."""
+    times_ms = [1e3 * time_s for time_s, _ in samples]
+    return {
+        f"p{p}": measured(float(np.percentile(times_ms, p)), "ms/tile", source) for p in (50, 90)
     }
 
 
@@ -109,8 +112,7 @@ def host_rows(
     for name, samples, (_, held_bytes) in zip(networks, runs, opened, strict=True):
         figures = _figures(samples, held_bytes) | conditions
         rows.append(Row("host", f"{name}, {tile_px} x {tile_px}", figures))
-    bands = _bands_of_step(source)
-    if sensor is not None and bands:
+    if sensor is not None and (bands := _bands_of_step(source)):
         figures = _step_figures(sensor, tile_px, bands, (min_runs, min_time_s))
         rows.append(Row("host", f"consistency step, {tile_px} x {tile_px}", figures))
     if other is not None:
@@ -155,10 +157,9 @@ def _step_figures(
             step.correction(raw, raw, side, side, (0, 0))
 
     correct()
-    samples = interleaved([correct], *least)[0]
-    times_ms = np.array([1e3 * time_s for time_s, _ in samples])
-    how = f"{counted(len(times_ms), 'run')} on one thread after one for warm-up"
-    return {f"p{p}": measured(float(np.percentile(times_ms, p)), "ms/tile", how) for p in (50, 90)}
+    (samples,) = interleaved([correct], *least)
+    runs = counted(len(samples), "run")
+    return _percentiles(samples, f"{runs} on one thread after one for warm-up")
 
 
 def conditions_of(threads: int) -> dict[str, Figure]:

@@ -5,8 +5,8 @@ predicted, and the paper's figures.
 """
 
 import math
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Sequence
 from itertools import product
 
 from beers_deploy.dpu.board import Dpu
@@ -101,20 +101,18 @@ def processor_row(swath: Swath, board: TargetProfile) -> Row:
     """
     cpu = board.tables.get("cpu", {})
     mpx = swath.band_pixels / 1e6
-    watts = board.tables.get("power", {}).get("cpu_run_w")
     power = unavailable("W", "no power of a run on this board's processor is published")
-    if watts is not None:
+    if watts := board.tables.get("power", {}).get("cpu_run_w"):
         power = published(watts.low, "W", watts.source)
-    constant = cpu.get(PIPELINE_TIME)
     cores = f", {counted(int(cpu['cores'].low), 'core')}" if "cores" in cpu else ""
     name = f"traditional pipeline on the processor of {board.name}{cores}"
-    if constant is None:
+    if PIPELINE_TIME not in cpu:
         reason = f"the target states no [cpu] {PIPELINE_TIME}"
         return Row(TABLE, name, {"latency": unavailable("s", reason), "power": power})
-    low_s = mpx * constant.low
-    high_s = mpx * constant.high
+    constant = cpu[PIPELINE_TIME]
+    ends_s = mpx * constant.low, mpx * constant.high
     # The two ends are factors apart: their geometric mean stands for the value.
-    latency = predicted(between((low_s, high_s)), "s", (low_s, high_s), constant.source)
+    latency = predicted(between(ends_s), "s", ends_s, constant.source)
     figures = {
         "latency": latency,
         "throughput": pipeline_rate(swath, latency),
@@ -186,11 +184,11 @@ def sweep_rows(
             "maps through memory": exact(prediction.streamed_bytes / 1e6, "MB/tile"),
             "layers on chip": exact(100 * sum(on_chip) / len(on_chip), "%"),
         }
-        bound = Counter[str]()
+        times_s = defaultdict[str, float](float)
         for layer in prediction.layers:
-            # A Counter is typed to hold integers: the times are added up in picoseconds.
-            bound[layer.bound] += round(1e12 * layer.time_s)
-        words = {"bound": bound.most_common(1)[0][0], "fitted range": fitted_range(prediction)}
+            times_s[layer.bound] += layer.time_s
+        longest = max(times_s, key=lambda bound: times_s[bound])
+        words = {"bound": longest, "fitted range": fitted_range(prediction)}
         rows.append(Row("sweep", f"{named(dpu)}, tiles of {swath.tile_px}", figures, words))
     return rows
 
@@ -213,24 +211,23 @@ def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) ->
         within_s: the time limit of the swath in s.
     """
     rows_per_board = len(rows) // len(boards)
-    names = dict[str, str]()
     # The rows of a board stand next to each other, the same number for each board.
-    placed = [(boards[k // rows_per_board].peak_ops_per_s, row) for k, row in enumerate(rows)]
-    ends: dict[str, Callable[[Figure], float | None]] = {
-        "by the whole interval": lambda latency: interval_ends(latency)[1],
-        "by the prediction": lambda latency: latency.value,
-        "at best": lambda latency: interval_ends(latency)[0],
+    peaks = [boards[k // rows_per_board].peak_ops_per_s for k in range(len(rows))]
+    latencies = [row.figures["latency"] for row in rows]
+    best_s, worst_s = zip(*map(interval_ends, latencies), strict=True)
+    ends = {
+        "by the whole interval": worst_s,
+        "by the prediction": [latency.value for latency in latencies],
+        "at best": best_s,
     }
-    for how, end in ends.items():
-        fits = [
-            (peak, row)
-            for peak, row in placed
-            if (end(row.figures["latency"]) or math.inf) <= within_s
-        ]
+    names = dict[str, str]()
+    for how, times_s in ends.items():
+        fits = [k for k, time_s in enumerate(times_s) if (time_s or math.inf) <= within_s]
         if fits:
-            peak, row = min(fits, key=lambda fit: fit[0])
+            smallest = min(fits, key=lambda k: peaks[k])
             # A DPU that is named for a surer level is not named again.
-            names.setdefault(f"{row.name} ({peak / 1e12:.3g} TOPS)", how)
+            name = f"{rows[smallest].name} ({peaks[smallest] / 1e12:.3g} TOPS)"
+            names.setdefault(name, how)
     words = "; ".join(f"{how} {name}" for name, how in names.items()) or "none of these"
     return f"the smallest DPU that takes {within_s:g} s or less: {words}"
 

@@ -111,7 +111,9 @@ def check_network(
     rows = _rows(placement, build, tile_px)
     checks = [legality(placement, npu=npu)]
     if for_compiler:
-        rows += _profile_rows(source.model)
+        for rule, names in implicit_parts(source.model).items():
+            figures = {"count": _count(len(names), "place")}
+            rows.append(Row("profile", rule, figures, {"first": "".join(names[:1])}))
         checks += _file_checks(source.model, build) if npu else []
     results = [op.out_shape for op in sized.operations if op.output in sized.outputs]
     # A result of unknown shape may be an image.
@@ -168,7 +170,13 @@ def _rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:
     """Return all rows: devices, refusals, nodes, subgraphs, crossing tensors, remarks, counts."""
     rows = [*_device_rows(placement, dpu), *_refusal_rows(placement)]
     for node in placement.nodes:
-        rows += _node_rows(node, placement, dpu)
+        words = {
+            "operator": node.op.op_type,
+            "part": node.part.removeprefix("dpu-") if dpu.target.npu else node.part,
+            "device": _device(node, placement, dpu),
+        }
+        whys = [{"rule": breach.text, **asdict(breach.finding)} for breach in node.broken]
+        rows += [Row("nodes", node.op.name, {}, words | why) for why in whys or [{}]]
     counts = {"nodes refused": _count(len(placement.failed), "node")}
     # It is not known into which parts an NPU's compiler cuts a network.
     if not dpu.target.npu:
@@ -213,14 +221,6 @@ def legality(placement: Placement, *, npu: bool = False) -> Check:
     return Check(name, len(failed), 0, "node", detail=first)
 
 
-def _profile_rows(model: onnx.ModelProto) -> list[Row]:
-    """Return a row for each rule of the safety-related profile about a board's file."""
-    return [
-        Row("profile", rule, {"count": _count(len(names), "place")}, {"first": "".join(names[:1])})
-        for rule, names in implicit_parts(model).items()
-    ]
-
-
 def _file_checks(model: onnx.ModelProto, dpu: Dpu) -> list[Check]:
     """Return the checks of a VINT8 file as a whole."""
     # ONNX allows both names for its own domain.
@@ -262,16 +262,6 @@ def _refusal_rows(placement: Placement) -> list[Row]:
         Row("refusals", rule, {"count": _count(count, "node")}, words[rule])
         for rule, count in counts.items()
     ]
-
-
-def _node_rows(node: PlacedNode, placement: Placement, dpu: Dpu) -> list[Row]:
-    words = {
-        "operator": node.op.op_type,
-        "part": node.part.removeprefix("dpu-") if dpu.target.npu else node.part,
-        "device": _device(node, placement, dpu),
-    }
-    whys = [{"rule": breach.text, **asdict(breach.finding)} for breach in node.broken]
-    return [Row("nodes", node.op.name, {}, words | why) for why in whys or [{}]]
 
 
 def _device(node: PlacedNode, placement: Placement, dpu: Dpu) -> str:
