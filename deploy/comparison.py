@@ -201,7 +201,7 @@ def compared(
         own: the samples that `data.own` read; None for simulated patches.
         metric: psnr, ssim or mae, to also compare the results with the references; "" for none.
     """
-    notes = []
+    notes = list[str]()
     if own is None:
         # This loads SciPy, which a user's own samples do not need.
         from beers_deploy.quant.samples.simulated import unseen_patches
@@ -236,14 +236,14 @@ def compared(
         rows.append(
             recorded.row("calibrated on", "recorded in the INT8 file, which nothing verifies")
         )
-    missing = uncovered(judged, recorded)
+    notes += filter(None, [uncovered(judged, recorded)])
     return Comparison(
         title=f"{floating.name} against {int8.name}",
         command="compare",
         arguments={"float": floating.name, "int8": int8.name, **data.arguments},
         inputs=(floating.input, int8.input, *rests_on),
         rows=tuple(rows),
-        notes=(*notes, missing) if missing else tuple(notes),
+        notes=tuple(notes),
         headings=HEADINGS,
         result=result,
         shares=shares,
@@ -278,21 +278,20 @@ def pair_of(
     """
     if int8_network is None and isinstance(float_network, Network) and float_network.origin:
         return float_network.origin.with_output(output), float_network
+    if int8_network is None and not stands_for_pair(float_network):
+        label = getattr(float_network, "name", type(float_network).__name__)
+        raise OptionError(
+            f"The INT8 network of {float_network if isinstance(float_network, str) else label} is "
+            "missing. Give it as `int8_network`, or give the name of a shipped pair."
+        )
+    if float_network is None:
+        float_network = VARIANT
     if int8_network is None:
-        if not stands_for_pair(float_network):
-            label = getattr(float_network, "name", type(float_network).__name__)
-            raise OptionError(
-                "The INT8 network of "
-                f"{float_network if isinstance(float_network, str) else label} is missing. "
-                "Give it as `int8_network`, or give the name of a shipped pair."
-            )
-        float_network = VARIANT if float_network is None else str(float_network).removesuffix(INT8)
+        float_network = str(float_network).removesuffix(INT8)
         # This refuses names under which nothing is shipped.
         shipped_weights(float_network)
         int8_network = f"{float_network}{INT8}"
-    floating = Network.load(
-        VARIANT if float_network is None else float_network, sensor=sensor, int8=False
-    )
+    floating = Network.load(float_network, sensor=sensor, int8=False)
     int8 = Network.load(int8_network, sensor=sensor, int8=True)
     require_quantized(floating.model, floating.label, expected=False)
     require_quantized(int8.model, int8.label, expected=True)

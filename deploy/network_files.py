@@ -73,14 +73,14 @@ class Conditioned:
         """
         if not int8:
             return float_for(self.weights, self.name, brightened(sensor, exposure.gain))
-        shipped = SHIPPED / f"{self.name}{INT8}.onnx"
         if self.weights.parent != SHIPPED:
             raise ModelError(
                 f"{self.weights} holds float weights, but an INT8 network is needed. Make one for "
                 f"every sensor with 'beers-deploy quantize {self.weights} --out "
                 f"{self.name}{INT8}.onnx'."
             )
-        return int8_for_sensor(load_onnx(shipped), sensor, exposure)
+        shipped = load_onnx(SHIPPED / f"{self.name}{INT8}.onnx")
+        return int8_for_sensor(shipped, sensor, exposure)
 
 
 @dataclass(frozen=True)
@@ -125,11 +125,9 @@ def conditioned(path: Path) -> Conditioned | None:
     if _is_shipped(path):
         name = path.name.removesuffix(INT8)
         return Conditioned(name, shipped_weights(name))
-    return (
-        Conditioned(path.stem, path)
-        if path.suffix == ".safetensors" and is_conditioned(path)
-        else None
-    )
+    if path.suffix == ".safetensors" and is_conditioned(path):
+        return Conditioned(path.stem, path)
+    return None
 
 
 def weights_file(path: Path) -> Path:

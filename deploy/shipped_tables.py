@@ -1,6 +1,7 @@
 """The shipped data as tables: sensors, scenes, boards, networks, and the constants of a profile."""
 
 from collections.abc import Mapping
+from itertools import product
 
 from beers_deploy.model.shipped import INT8, shipped_names
 from beers_deploy.profiles.constant import Constant, Words
@@ -65,13 +66,8 @@ def _figure(constant: Constant, unit: str) -> Figure:
     """Return a constant as a figure, in which a range is the interval around its middle."""
     interval = None if constant.low == constant.high else (constant.low, constant.high)
     mode: Mode = "measured" if constant.status == "measured" else "published"
-    return Figure(
-        (constant.low + constant.high) / 2,
-        unit,
-        mode,
-        f"{constant.status}: {constant.source}",
-        interval,
-    )
+    source = f"{constant.status}: {constant.source}"
+    return Figure(constant.middle, unit, mode, source, interval)
 
 
 def networks() -> Table:
@@ -83,10 +79,11 @@ def networks() -> Table:
         >>> "convbeers-s-int8" in bd.networks().to_pandas().index
         True
     """
-    rows = []
-    for name in shipped_names():
-        rows.append(Row("networks", name, {}, {"precision": "float32"}))
-        rows.append(Row("networks", f"{name}{INT8}", {}, {"precision": "int8"}))
+    pairs = product(shipped_names(), (("", "float32"), (INT8, "int8")))
+    rows = [
+        Row("networks", f"{name}{suffix}", {}, {"precision": precision})
+        for name, (suffix, precision) in pairs
+    ]
     return Table("networks", rows=tuple(rows))
 
 

@@ -361,7 +361,8 @@ def file_checks(
     with faults_named(int8.label):
         core = as_on_board(int8.model)
         graph = network_of(core, usual_tile_px(core), int8.name)
-    return [legality(place(graph, device_of(target)), npu=bool(target.npu)), *checks]
+    dpu = device_of(target)
+    return [legality(place(graph, dpu), dpu), *checks]
 
 
 def junit_text(title: str, checks: Sequence[Check]) -> str:

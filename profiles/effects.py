@@ -326,13 +326,11 @@ def _spread(excess: np.ndarray, length_px: float) -> np.ndarray:
     normalised.
     """
     radius = min(int(6 * length_px) + 1, excess.shape[-2] - 1)
-    if radius < 1:
-        return np.zeros_like(excess)
     distance = np.abs(np.arange(-radius, radius + 1, dtype=np.float64))
     # A length near 0 reaches no neighbour.
     with np.errstate(over="ignore"):
         kernel = np.exp(-distance / length_px) * (distance > 0)
-    # The length is so short that not even a neighbour is reached.
+    # The image has one row, or the length is so short that not even a neighbour is reached.
     if kernel.sum() == 0:
         return np.zeros_like(excess)
     # Loading SciPy takes a sixth of a second, and few sensors need it.

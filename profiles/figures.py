@@ -45,7 +45,7 @@ class Figure:
     reason: str = ""
 
     def __post_init__(self) -> None:
-        if not all(math.isfinite(number) for number in (self.value or 0.0, *(self.interval or ()))):
+        if not all(map(math.isfinite, (self.value or 0.0, *(self.interval or ())))):
             raise ValueError(f"a figure that is not finite: {self.value} {self.interval or ''}")
 
     def to_json(self) -> dict[str, object]:
@@ -90,10 +90,9 @@ def measured(
     """
     if not math.isfinite(value):
         return unavailable(unit, f"{NOT_FINITE} ({float(value)}): {source}")
-    finite_interval = (
-        interval if interval is not None and all(math.isfinite(end) for end in interval) else None
-    )
-    return Figure(float(value), unit, "measured", source, finite_interval)
+    if interval is not None and not all(map(math.isfinite, interval)):
+        interval = None
+    return Figure(float(value), unit, "measured", source, interval)
 
 
 def predicted(value: float, unit: str, interval: tuple[float, float], source: str) -> Figure:
@@ -107,7 +106,7 @@ def predicted(value: float, unit: str, interval: tuple[float, float], source: st
         interval: the range in which the true value is expected.
         source: the name of the model that computed it.
     """
-    if not all(math.isfinite(number) for number in (value, *interval)):
+    if not all(map(math.isfinite, (value, *interval))):
         return unavailable(unit, f"{NOT_FINITE} ({float(value)}): {source}")
     return Figure(float(value), unit, "predicted", source, (float(interval[0]), float(interval[1])))
 

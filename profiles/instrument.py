@@ -91,10 +91,8 @@ class Instrument:
         """Contrast at 0.5 cycles per pixel (across the track, along it), that is horizontally and
         vertically.
         """
-        return (
-            self.mtf_nyquist,
-            self.mtf_nyquist if self.mtf_nyquist_along is None else self.mtf_nyquist_along,
-        )
+        across = self.mtf_nyquist
+        return across, across if self.mtf_nyquist_along is None else self.mtf_nyquist_along
 
     @property
     def max_dn(self) -> int:
@@ -146,9 +144,10 @@ def with_offset_of(others: Mapping[str, E], own: Mapping[str, E]) -> dict[str, E
             them the result has none.
         own: effects from which everything but the offset is taken, by name.
     """
-    return {name: effect for name, effect in own.items() if name != OFFSET} | {
-        name: effect for name, effect in others.items() if name == OFFSET
-    }
+    effects = {name: effect for name, effect in own.items() if name != OFFSET}
+    if OFFSET in others:
+        effects[OFFSET] = others[OFFSET]
+    return effects
 
 
 def mtf_limit(antialias_sigma_px: float) -> float:

@@ -63,7 +63,18 @@ class PointSpreadFile:
                 f"got {printable(repr(self.psf))}. Copy the file there."
             )
         where = f"{label} mtf.psf ({folder / self.psf})"
-        samples = _normalised(where, _read_samples(where, folder / self.psf))
+        samples = _read_samples(where, folder / self.psf)
+        finite = bool(np.isfinite(samples).all())
+        # The largest is brought to 1 first, because the sum of finite samples may overflow.
+        samples = samples / max(float(np.abs(samples).max()), 1e-300) if finite else samples
+        total = float(samples.sum())
+        if not finite or total <= 0:
+            fault = f"their sum is {total:g}" if finite else "some are NaN or infinite"
+            raise ProfileError(
+                f"{where} must hold finite samples whose sum is above 0, but {fault}. Correct the "
+                "file; a background must be subtracted first."
+            )
+        samples = samples / total
         shift_px = math.hypot(*centroid(samples)) / self.psf_samples_per_px
         if shift_px > OFF_CENTRE_PX:
             raise ProfileError(
@@ -94,21 +105,6 @@ class PointSpreadFile:
             "samples_per_px": self.psf_samples_per_px,
         }
         return validated(PointSpread, fields, where)
-
-
-def _normalised(where: str, samples: Array) -> Array:
-    """Scale the samples to a sum of 1, or raise ProfileError if that is not possible."""
-    finite = bool(np.isfinite(samples).all())
-    # The largest is brought to 1 first, because the sum of finite samples may overflow.
-    samples = samples / max(float(np.abs(samples).max()), 1e-300) if finite else samples
-    total = float(samples.sum())
-    if not finite or total <= 0:
-        fault = f"their sum is {total:g}" if finite else "some are NaN or infinite"
-        raise ProfileError(
-            f"{where} must hold finite samples whose sum is above 0, but {fault}. Correct the "
-            "file; a background must be subtracted first."
-        )
-    return samples / total
 
 
 def _read_samples(where: str, path: Path) -> Array:

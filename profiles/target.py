@@ -99,16 +99,14 @@ class TargetProfile:
         Raises:
             ProfileError: unknown name, wrong or missing key, or a number that no board can have.
         """
-        if isinstance(board, cls):
-            return board
-        if not isinstance(board, TargetProfile | str | os.PathLike):
+        if isinstance(board, str | os.PathLike):
+            board = _read(os.fspath(board).removesuffix(MODEL_SUFFIX))
+        if not isinstance(board, TargetProfile):
             raise ProfileError(
                 "A board must be a Board, a name or the path of a .toml file, got "
                 f"{type(board).__name__}. 'beers-deploy profiles' lists the names."
             )
-        if not isinstance(board, TargetProfile):
-            board = _read(os.fspath(board).removesuffix(MODEL_SUFFIX))
-        return cls(**vars(board))
+        return board if isinstance(board, cls) else cls(**vars(board))
 
     def __repr__(self) -> str:
         builds = f", {', '.join(self.configurations)}" if self.configurations else ""

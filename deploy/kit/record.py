@@ -46,11 +46,6 @@ BULKY = {CORE, SENSOR_BIASES}
 """Metadata of a file that holds long lists of numbers, which the record omits."""
 
 
-def recorded(folder: Path) -> list[Path]:
-    """Return the paths of the three files of a record: JSON, HTML page, and bill of materials."""
-    return [folder / name for name in RECORD]
-
-
 def require_library() -> None:
     """Raise MissingExtraError if the library that writes the bill of materials is missing or does
     not load.
@@ -79,8 +74,8 @@ def write_record(
     record = record_of(judged, network, sensor, floating)
     # All three are made before the first is written, so that a record is complete or absent.
     texts = json.dumps(record, indent=1) + "\n", render(_page(judged, record)), bill_of(record)
-    for path, text in zip(recorded(folder), texts, strict=True):
-        write_text(path, text)
+    for name, text in zip(RECORD, texts, strict=True):
+        write_text(folder / name, text)
 
 
 def record_of(
@@ -152,11 +147,10 @@ def _verified_weights(network: Network, sensor: Sensor, floating: Network | None
 
 def _texts(name: str, fact: object) -> Iterator[tuple[str, str]]:
     """Yield each single fact in a document, with the keys that lead to it."""
-    parts = fact
     if isinstance(fact, list) and any(isinstance(part, dict) for part in fact):
-        parts = dict(enumerate(fact, 1))
-    if isinstance(parts, dict):
-        for key, part in parts.items():
+        fact = dict(enumerate(fact, 1))
+    if isinstance(fact, dict):
+        for key, part in fact.items():
             yield from _texts(f"{name} {key}".strip(), part)
     elif isinstance(fact, list):
         yield name, ", ".join(map(str, fact))
@@ -171,15 +165,10 @@ def _page(judged: Table, record: dict[str, Any]) -> Report:
     claims = [
         Row("claims", key, {}, {"claim": printable(value)}) for key, value in record["says"].items()
     ]
-    checks = [
-        Row(
-            "checks",
-            check.name,
-            {},
-            {"found": check.actual, "allowed": check.allowed, "passed": str(check.passed)},
-        )
-        for check in judged.checks
-    ]
+    checks = []
+    for check in judged.checks:
+        words = {"found": check.actual, "allowed": check.allowed, "passed": str(check.passed)}
+        checks.append(Row("checks", check.name, {}, words))
     tables = [
         Section("What it is", rows),
         Section("Checks", checks),

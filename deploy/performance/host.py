@@ -6,6 +6,7 @@ reported with each time.
 
 import statistics
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 
 import numpy as np
@@ -112,7 +113,11 @@ def host_rows(
     for name, samples, (_, held_bytes) in zip(networks, runs, opened, strict=True):
         figures = _figures(samples, held_bytes) | conditions
         rows.append(Row("host", f"{name}, {tile_px} x {tile_px}", figures))
-    if sensor is not None and (bands := _bands_of_step(source)):
+    bands = 0
+    # The step cannot follow a network that cannot be tiled.
+    with suppress(ModelError):
+        bands = source.geometry.channels_out if keeps_pixels(source.geometry) else 0
+    if sensor is not None and bands:
         figures = _step_figures(sensor, tile_px, bands, (min_runs, min_time_s))
         rows.append(Row("host", f"consistency step, {tile_px} x {tile_px}", figures))
     if other is not None:
@@ -121,17 +126,6 @@ def host_rows(
         figure = measured(ratio, "x", f"medians of {len(runs[0])} runs each, interleaved")
         rows.append(Row("host", "float32 time / INT8 time, here", {"ratio": figure}))
     return rows
-
-
-def _bands_of_step(network: Network) -> int:
-    """Return the number of bands that the consistency step corrects after a network; 0 if it cannot
-    follow the network.
-    """
-    try:
-        tiling = network.geometry
-    except ModelError:
-        return 0
-    return tiling.channels_out if keeps_pixels(tiling) else 0
 
 
 def _step_figures(

@@ -118,10 +118,9 @@ def render(report: Report) -> str:
         columns += [_head(word, word=True) for word in words]
         cells = []
         for row in rows:
+            texts = [row.text.get(word, "") for word in words]
             line = [_cell(row.figures.get(column.name)) for column in figures]
-            for word in words:
-                text = row.text.get(word, "")
-                line.append({"text": text, "mode": "word", "title": "", "value": text})
+            line += [{"text": text, "mode": "word", "title": "", "value": text} for text in texts]
             cells.append(line)
         sides = [columns, [_head(row.name) for row in rows]]
         if not report.sorts and len(columns) > max(WIDE, len(rows)):

@@ -179,18 +179,16 @@ def _stretched(planes: Planes, stretches: Sequence[Stretch]) -> Pixels:
     return _picture(shown)
 
 
-def _picture(shown: Sequence[Pixels]) -> Pixels:
-    return shown[0] if len(shown) == 1 else np.stack(shown, axis=-1)
+def _picture(shown: Sequence[Pixels] | Pixels) -> Pixels:
+    return shown[0] if len(shown) == 1 else np.stack(list(shown), axis=-1)
 
 
 def _difference(before: Planes, after: Planes, unit: str, pixel_px: float) -> Layer:
     """Return restored minus raw: mid-grey is no change, and black and white are equal changes."""
-    sample = np.concatenate([_sample(x - y) for x, y in zip(after, before, strict=True)])
+    sample = np.concatenate([_sample(plane) for plane in after - before])
     most = float(np.percentile(np.abs(sample), MOST_CHANGE))
-    shown = []
-    for x, y in zip(after, before, strict=True):
-        share = np.nan_to_num((x - y) / max(most, 1e-6))
-        shown.append(np.rint(127.5 + 127.5 * np.clip(share, -1, 1)).astype(np.uint8))
+    share = np.nan_to_num((after - before) / max(most, 1e-6))
+    shown = np.rint(127.5 + 127.5 * np.clip(share, -1, 1)).astype(np.uint8)
     legend = (
         ("#000", f"restored is darker by {most:.3g} {unit} or more"),
         ("#808080", "no change"),
@@ -328,19 +326,17 @@ def pyramid(picture: Image.Image) -> list[list[list[str]]]:
     while max(levels[0].size) > TILE_PX:
         levels.insert(0, levels[0].reduce(2))
     tiles = []
+    # JPEG has no opacity.
+    kind = "png" if picture.mode == "RGBA" else "jpeg"
     for level in levels:
         width, height = level.size
         rows = []
         for top in range(0, height, TILE_PX):
-            bottom = min(top + TILE_PX, height)
             row = []
             for left in range(0, width, TILE_PX):
-                right = min(left + TILE_PX, width)
+                box = (left, top, min(left + TILE_PX, width), min(top + TILE_PX, height))
                 buffer = io.BytesIO()
-                # JPEG has no opacity.
-                kind = "png" if level.mode == "RGBA" else "jpeg"
-                tile = level.crop((left, top, right, bottom))
-                tile.save(buffer, kind, quality=QUALITY, subsampling=0)
+                level.crop(box).save(buffer, kind, quality=QUALITY, subsampling=0)
                 content = base64.b64encode(buffer.getvalue()).decode()
                 row.append(f"data:image/{kind};base64,{content}")
             rows.append(row)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import uniform_filter1d
 
 from beers_deploy.model.metrics.detector_lines import REACH, Blocks
@@ -236,14 +237,8 @@ def _alone(second: np.ndarray, error: np.ndarray, margin: float) -> np.ndarray:
     ones after them over -g, the isolation r - q is 1 for a detector.
     """
     padded = np.pad(second, REACH, constant_values=np.nan)
-    count = len(second)
-    around = [
-        padded[REACH + step : REACH + step + count] for step in range(-REACH, REACH + 1) if step
-    ]
-    expected = np.array(
-        [-1 / 2 if abs(step) == 1 else 0.0 for step in range(-REACH, REACH + 1) if step]
-    )
-    beside = np.array(around)
+    beside = np.delete(sliding_window_view(padded, 2 * REACH + 1).T, REACH, axis=0)
+    expected = np.array([0, 0, -1 / 2, -1 / 2, 0, 0])
     near = beside[2] + beside[3]
     far = beside[1] + beside[4]
     with np.errstate(invalid="ignore", divide="ignore"):

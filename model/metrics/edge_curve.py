@@ -13,8 +13,9 @@ not leave bins empty.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -141,13 +142,13 @@ def measure_curve(edges: Sequence[Edge], generator: np.random.Generator) -> MtfC
         edges: pixels, and the approximate line of each edge.
         generator: the random generator for the draws of the interval.
     """
-    fitted = _first_fits(edges)
+    fitted = _fits(edges, START, FIRST_PASSES)
     weights = START
     for _ in range(ROUNDS):
         if not fitted:
             break
         weights = _solved(fitted, weights)
-        fitted = _fitted_again(fitted, weights)
+        fitted = _fits(map(edge_of, fitted), weights, PASSES)
     if not fitted:
         return Refusal("no straight edge")
     if mtf_at(SHARP_CPX, weights) > SHARPEST * np.sinc(SHARP_CPX):
@@ -176,7 +177,7 @@ def search_curve(edges: Sequence[Edge], generator: np.random.Generator) -> MtfCu
         generator: the random generator for the draws of the interval.
     """
     sample = edges[:: max(len(edges) // MOST_FITTED, 1)]
-    fitted = sorted(_first_fits(sample), key=lambda edge: edge.unevenness)
+    fitted = sorted(_fits(sample, START, FIRST_PASSES), key=lambda edge: edge.unevenness)
     result: MtfCurve | Refusal = Refusal("no straight edge")
     for unevenness, least, floor in TIERS:
         tier = [edge for edge in fitted if edge.unevenness <= unevenness][:MOST_EDGES]
@@ -200,7 +201,7 @@ def _curve_of_sharpest(
         if len(sharp) < least:
             break
         weights = _solved(sharp, weights)
-        fitted = _fitted_again(fitted, weights)
+        fitted = _fits(map(edge_of, fitted), weights, PASSES)
         values, errors = softness(fitted, weights)
         precise = errors <= MAX_ERROR_PX
         # Texture scatters the softness by more than the noise that its own error counts.
@@ -224,24 +225,25 @@ def _curve_of_sharpest(
     )
 
 
-def _first_fits(edges: Sequence[Edge]) -> list[FittedEdge]:
-    """Return those edges whose line stays within their pixels, fitted to the initial curve."""
-    fits = (fit_edge(pixels, line, START, FIRST_PASSES) for pixels, line in edges)
+edge_of = attrgetter("pixels", "line")
+"""Return the pixels and the line of a fitted edge."""
+
+
+def _fits(edges: Iterable[Edge], weights: np.ndarray, passes: int) -> list[FittedEdge]:
+    """Return those edges whose line stays within their pixels, fitted to a curve."""
+    fits = (fit_edge(pixels, line, weights, passes) for pixels, line in edges)
     return [edge for edge in fits if edge is not None]
-
-
-def _fitted_again(edges: Sequence[FittedEdge], weights: np.ndarray) -> list[FittedEdge]:
-    """Return the edges with lines and planes for another curve."""
-    again = (fit_edge(edge.pixels, edge.line, weights, PASSES) for edge in edges)
-    return [edge for edge in again if edge is not None]
 
 
 def _solved(edges: Sequence[FittedEdge], weights: np.ndarray) -> np.ndarray:
     """Return the curve that fits all edges best."""
-    grams, moments = zip(*(normal_equations(edge, weights) for edge in edges), strict=True)
-    gram = np.sum(grams, axis=0)
-    moment = np.sum(moments, axis=0)
+    gram, moment = _added(normal_equations(edge, weights) for edge in edges)
     return solve(gram, moment, weights, likeliest_bend(gram, moment, weights))
+
+
+def _added(equations: Iterable[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
+    """Return the sum of the left sides of normal equations, and that of the right sides."""
+    return [np.sum(sides, axis=0) for sides in zip(*equations, strict=True)]
 
 
 def sharpest(values: np.ndarray, errors: np.ndarray) -> float:
@@ -304,8 +306,7 @@ def _drawn(
                 sample.append((gram, moment + axes @ deviations))
         else:
             sample = [equations[number] for number in generator.integers(count, size=count)]
-        gram = np.sum([pair[0] for pair in sample], axis=0)
-        moment = np.sum([pair[1] for pair in sample], axis=0)
+        gram, moment = _added(sample)
         # Where pixels determine little, the expected smoothness decides. It is drawn too, and is
         # the loosest possible, so that the interval includes what a smooth curve hides.
         draws.append(solve(gram, moment, weights, BENDS[-1], generator.standard_normal(PARTS - 3)))

@@ -300,7 +300,7 @@ class Lpips(nn.Module):
 
         Its gradient is finite everywhere. Images of other shapes, or too small, raise ImageError.
         """
-        _check_pair(self.label, self.backbone, image, reference)
+        _check_pair(self, image, reference)
         with torch.autocast(image.device.type, enabled=False):
             pairs = zip(self.backbone(image)[1:], self.backbone(reference)[1:], strict=True)
             errors = [(_unit(a) - _unit(b)).square().mean(dim=(2, 3)) for a, b in pairs]
@@ -342,7 +342,7 @@ class Dists(nn.Module):
 
         Its gradient is finite everywhere. Images of other shapes, or too small, raise ImageError.
         """
-        _check_pair(self.label, self.backbone, image, reference)
+        _check_pair(self, image, reference)
         with torch.autocast(image.device.type, enabled=False):
             stages = zip(self.backbone(image), self.backbone(reference), strict=True)
             textures = []
@@ -374,11 +374,11 @@ def _unit(features: Tensor) -> Tensor:
     return features / features.square().sum(dim=1, keepdim=True).clamp(min=MIN_NORM**2).sqrt()
 
 
-def _check_pair(label: str, backbone: Backbone, image: Tensor, reference: Tensor) -> None:
-    smallest = backbone.spec.min_side_px
+def _check_pair(metric: Lpips | Dists, image: Tensor, reference: Tensor) -> None:
+    smallest = metric.backbone.spec.min_side_px
     grey = image.ndim == 4 and image.shape[1] == 1 and image.shape == reference.shape
     if not grey or min(image.shape[2:]) < smallest:
         raise ImageError(
-            f"{label} needs two grey images (N, 1, H, W) of one shape and at least {smallest} "
-            f"pixels a side, got {tuple(image.shape)} and {tuple(reference.shape)}."
+            f"{metric.label} needs two grey images (N, 1, H, W) of one shape and at least "
+            f"{smallest} pixels a side, got {tuple(image.shape)} and {tuple(reference.shape)}."
         )

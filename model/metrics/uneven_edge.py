@@ -239,12 +239,16 @@ def normal_equations(
         normal = normal * root_counts[:, None]
         curve = curve * root_counts[:, None]
         residuals = residuals * root_counts
-    # The part that planes and line could explain is removed, so that the rest depends on the curve
-    # alone.
-    basis, _ = np.linalg.qr(normal)
-    curve = curve - basis @ (basis.T @ curve)
-    residuals = residuals - basis @ (basis.T @ residuals)
+    curve, residuals = _unexplained(normal, curve, residuals)
     return curve.T @ curve, curve.T @ (residuals + curve @ weights)
+
+
+def _unexplained(normal: np.ndarray, *values: np.ndarray) -> list[np.ndarray]:
+    """Return values without the part that planes and line could explain, so that the rest depends
+    on the curve alone.
+    """
+    basis, _ = np.linalg.qr(normal)
+    return [value - basis @ (basis.T @ value) for value in values]
 
 
 def strips_of(edge: FittedEdge) -> int:
@@ -268,10 +272,8 @@ def softness(edges: Sequence[FittedEdge], weights: np.ndarray) -> tuple[np.ndarr
     values = []
     errors = []
     for edge in edges:
-        by_softness = edge.curve @ (softened(weights, SOFTER_PX) - weights) / SOFTER_PX
-        basis, _ = np.linalg.qr(edge.normal)
-        by_softness = by_softness - basis @ (basis.T @ by_softness)
-        residuals = edge.rest - basis @ (basis.T @ edge.rest)
+        change = edge.curve @ (softened(weights, SOFTER_PX) - weights) / SOFTER_PX
+        by_softness, residuals = _unexplained(edge.normal, change, edge.rest)
         size = float(by_softness @ by_softness)
         value = float(by_softness @ residuals) / size
         contributions = (by_softness * (residuals - value * by_softness))[: edge.strip.size]

@@ -153,12 +153,16 @@ def place(network: SizedGraph, dpu: Dpu) -> Placement:
     """
     # A misspelt constant would silence the rule that it is for.
     require_known(dpu)
-    parts = _parts(network)
+    convolutions = (op for op in network.operations if op.kind in CONVOLUTIONS)
+    convolved = set(chain.from_iterable(op.outputs for op in convolutions))
+    behind, before = (
+        _reached(network.operations, convolved, forwards=forwards) for forwards in (True, False)
+    )
+    parts = _parts(network, behind, before)
     pairs = zip(network.operations, parts, strict=True)
     broken = [judge(op, dpu, network.quantized) if part == "dpu-core" else () for op, part in pairs]
     # In a float file a cut at an end only costs time.
     if not network.quantized:
-        before = _reached(network.operations, _convolved(network), forwards=False)
         cpu_results: set[str] = set()
         for number, op in enumerate(network.operations):
             trails = op.output not in before
@@ -170,26 +174,27 @@ def place(network: SizedGraph, dpu: Dpu) -> Placement:
                 parts[number] = "host-back"
             if trails and (broken[number] or follows):
                 cpu_results |= set(op.outputs)
-    devices: list[Device] = []
-    for part, rules in zip(parts, broken, strict=True):
-        on_core: Device = "CPU" if rules else "DPU"
-        devices.append(on_core if part == "dpu-core" else "host")
+    devices: list[Device] = ["CPU" if rules else "DPU" for rules in broken]
+    for number, part in enumerate(parts):
+        if part != "dpu-core":
+            devices[number] = "host"
     subgraphs = _subgraphs(network.operations, devices)
     nodes = tuple(map(PlacedNode, network.operations, parts, devices, broken, subgraphs))
     return Placement(nodes, tuple(_cuts(network, nodes)), "" if network.quantized else FLOAT_NOTE)
 
 
-def _parts(network: SizedGraph) -> list[Part]:
+def _parts(network: SizedGraph, behind: set[str], before: set[str]) -> list[Part]:
     """Return the part of each node. A node before the first or after the last convolution belongs
     to the host if it is of a kind that the host computes.
+
+    Args:
+        network: the network.
+        behind: the results that are computed from one of a convolution.
+        before: the results from which one of a convolution is computed.
     """
-    operations = network.operations
-    behind, before = (
-        _reached(operations, _convolved(network), forwards=forwards) for forwards in (True, False)
-    )
     parts: list[Part] = []
     finished: set[str] = set()
-    for op in operations:
+    for op in network.operations:
         leads = op.output not in behind
         trails = op.output not in before
         # The host cannot run an operator that no processor here computes.
@@ -203,11 +208,6 @@ def _parts(network: SizedGraph) -> list[Part]:
         else:
             parts.append("dpu-core")
     return parts
-
-
-def _convolved(network: SizedGraph) -> set[str]:
-    convolutions = (op for op in network.operations if op.kind in CONVOLUTIONS)
-    return set(chain.from_iterable(op.outputs for op in convolutions))
 
 
 def _reached(operations: Sequence[Operation], starts: set[str], *, forwards: bool) -> set[str]:

@@ -104,22 +104,27 @@ def check_network(
     tile_px = usual_tile_px(core) if tile is None else tile
     sized = network_of(core, tile_px, source.label)
     placement = place(sized, build)
-    npu = bool(target.npu)
     quantized = is_quantized(source.model)
     # A float file or a host's file is not for a compiler.
     for_compiler = quantized and KEY not in metadata(source.model)
     rows = _rows(placement, build, tile_px)
-    checks = [legality(placement, npu=npu)]
+    checks = [legality(placement, build)]
     if for_compiler:
         for rule, names in implicit_parts(source.model).items():
             figures = {"count": _count(len(names), "place")}
             rows.append(Row("profile", rule, figures, {"first": "".join(names[:1])}))
-        checks += _file_checks(source.model, build) if npu else []
+        checks += _file_checks(source.model, build) if target.npu else []
     results = [op.out_shape for op in sized.operations if op.output in sized.outputs]
     # A result of unknown shape may be an image.
     makes_image = bool(results) and all(shape is None or min(shape[1:]) > 1 for shape in results)
     if makes_image and not quantized:
-        reason = _refusal(source.model)
+        # First, because the inputs of a file that is refused may include weights.
+        reason = refusal(source.model)
+        try:
+            if not reason:
+                fixed_tile_px(source.model)
+        except ModelError as error:
+            reason = str(error)
         checks.append(Check(ACCEPTED, int(bool(reason)), 0, "network", detail=reason))
     # A quantised file whose numbers nobody reads here is placed as if it were in float.
     note = OTHERS_NOTE if placement.note and quantized else placement.note
@@ -152,18 +157,6 @@ DETAILS = frozenset({"nodes", "subgraphs", "summary"})
 
 
 ACCEPTED = "networks that 'quantize' refuses"
-
-
-def _refusal(model: onnx.ModelProto) -> str:
-    """Return why `quantize` refuses a float network or its input; "" if it accepts both."""
-    # First, because the inputs of a file that is refused may include weights.
-    if reason := refusal(model):
-        return reason
-    try:
-        fixed_tile_px(model)
-    except ModelError as error:
-        return str(error)
-    return ""
 
 
 def _rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:
@@ -207,15 +200,15 @@ def _part_rows(placement: Placement) -> list[Row]:
     return rows
 
 
-def legality(placement: Placement, *, npu: bool = False) -> Check:
+def legality(placement: Placement, dpu: Dpu) -> Check:
     """Summarise a placement as one check, which fails if a node of the core breaks a rule.
 
     Args:
         placement: where each node runs.
-        npu: True for an NPU. The name of the check then does not say that nodes are refused,
-            because AMD publishes no limits of its compiler.
+        dpu: the device. AMD publishes no limits of an NPU's compiler, so the name of the check does
+            not say that nodes are refused.
     """
-    name = "nodes that break a rule" if npu else "nodes the DPU refuses"
+    name = "nodes that break a rule" if dpu.target.npu else "nodes the DPU refuses"
     failed = placement.failed
     first = f"{failed[0].op.name}: {failed[0].broken[0].finding.reason}" if failed else ""
     return Check(name, len(failed), 0, "node", detail=first)

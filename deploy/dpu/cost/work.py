@@ -97,22 +97,21 @@ def count_work(operations: Sequence[Operation], dpu: Dpu) -> tuple[Work, ...]:
         One entry for each operation, except those of the kinds FUSED, which cost nothing.
     """
     flow = _Flow(operations, dpu)
-    works = []
-    for op in operations:
-        if op.kind not in FUSED:
-            work = Work(
-                name=op.name,
-                kind=op.kind,
-                operations=op.operations,
-                array_operations=_array_operations(op, dpu),
-                lane_steps=_lane_steps(op, dpu),
-                weight_bytes=op.weight_bytes,
-                load_map_bytes=flow.load(op),
-                store_map_bytes=flow.store(op),
-                serial=flow.serial(op),
-            )
-            works.append(work)
-    return tuple(works)
+    return tuple(
+        Work(
+            name=op.name,
+            kind=op.kind,
+            operations=op.operations,
+            array_operations=_array_operations(op, dpu),
+            lane_steps=_lane_steps(op, dpu),
+            weight_bytes=op.weight_bytes,
+            load_map_bytes=flow.load(op),
+            store_map_bytes=flow.store(op),
+            serial=flow.serial(op),
+        )
+        for op in operations
+        if op.kind not in FUSED
+    )
 
 
 def _array_operations(op: Operation, dpu: Dpu) -> int:
@@ -207,10 +206,11 @@ class _Flow:
             if op.kind == "concat":
                 fed = zip(op.inputs, op.in_shapes, strict=True)
                 self._pieces |= {self._root(name): shape[0] for name, shape in fed if shape}
-        sums = [op for op in computing if op.kind in ("add", "mul")]
         inputs = chain.from_iterable(op.inputs for op in computing if op.kind == "concat")
-        self._stored = {self._root(name) for name in inputs}
-        self._sums = {self._root(self._fused(op)): op.output for op in sums}
+        self._stored = set(map(self._root, inputs))
+        self._sums = {
+            self._root(self._fused(op)): op.output for op in computing if op.kind in ("add", "mul")
+        }
 
     def serial(self, op: Operation) -> bool:
         """Return True if an operation adds or multiplies two maps that do not fit on the chip."""
@@ -238,12 +238,8 @@ class _Flow:
         if op.kind in ("add", "mul"):
             fused = self._root(self._fused(op))
             here = {fused, *self._reads.get(fused, ())}
-        fed = zip(op.inputs, op.in_shapes, strict=True)
-        return sum(
-            _size(shape)
-            for name, shape in fed
-            if self._root(name) not in here and self._leaves(name)
-        )
+        fed = zip(map(self._root, op.inputs), op.in_shapes, strict=True)
+        return sum(_size(shape) for root, shape in fed if root not in here and self._leaves(root))
 
     def store(self, op: Operation) -> int:
         """Return the bytes that an operation writes to memory.
@@ -267,8 +263,7 @@ class _Flow:
         """Return the operand of an add that is computed last."""
         return max(add.inputs, key=lambda name: self._order.get(self._root(name), -1))
 
-    def _leaves(self, name: str) -> bool:
-        root = self._root(name)
+    def _leaves(self, root: str) -> bool:
         outside = root not in self._order or root in self._concats
         return outside or not self._fits(root) or self._readers[root] > SHARING
 
@@ -282,7 +277,7 @@ class _Flow:
 
 
 def _size(shape: Shape | None) -> int:
-    return shape[0] * shape[1] * shape[2] if shape else 0
+    return math.prod(shape) if shape else 0
 
 
 def largest_map_bytes(operations: Sequence[Operation]) -> int:
