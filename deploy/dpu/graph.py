@@ -114,7 +114,13 @@ def out_shape(
         )
         return (channels, rows, columns) if min(rows, columns) > 0 else None
     if kind == "concat" and len(inputs) > 1:
-        return (sum(shape[0] for shape in inputs), first[1], first[2])
+        joined = node.attributes["axis"] % 4
+        # ONNX counts the axis of the images too.
+        sides = [
+            sum(side) if axis == joined else side[0]
+            for axis, side in enumerate(zip(*inputs, strict=True), 1)
+        ]
+        return (sides[0], sides[1], sides[2])
     if kind in ("add", "mul") or node.op_type == "Where":
         channels, rows, columns = map(max, zip(*inputs, strict=True))
         return (channels, rows, columns)

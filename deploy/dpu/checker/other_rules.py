@@ -322,6 +322,9 @@ def maps_aligned(op: Operation, dpu: Dpu) -> Finding | None:
     # ONNX broadcasts a map of 1 x 1 over a larger one.
     if op.kind not in ("add", "mul", "concat") or len(sizes - {(1, 1)}) < 2:
         return None
+    # Maps that are joined along their height or width may differ in it.
+    if op.attributes.get("axis", 1) % 4 != 1:
+        return None
     remedy = (
         "use a tile whose side is a multiple of the network's total stride, or pad the smaller map"
     )

@@ -213,6 +213,8 @@ ATTENDED = f"a = GlobalAveragePool(x) b = Conv(a, w8x8x1x1) c = Mul(x, b) y = {S
         # An odd tile halved and doubled is another size.
         (ENLARGED, 21, ["maps aligned"]),
         (ENLARGED, 22, []),
+        # Maps of two heights, one below the other.
+        (f"a = MaxPool<kernel_shape=[2,1]>(x) b = Concat<axis=2>(a, x) y = {SAME}(b, w)", 21, []),
         # The factor needs no map of the same size.
         (ATTENDED, 37, []),
     ],

@@ -34,6 +34,15 @@ def test_an_unknown_operator_hides_the_shape_but_not_the_network(tmp_path: Path)
         _ = after.operations
 
 
+@pytest.mark.parametrize(
+    ("axis", "shape"), [(1, (16, 30, 30)), (2, (8, 60, 30)), (-1, (8, 30, 60)), (-3, (16, 30, 30))]
+)
+def test_maps_are_joined_along_any_axis(axis: int, shape: tuple[int, ...], tmp_path: Path) -> None:
+    model = written(f"a = {SAME}(image, w) b = {SAME}(image, w) y = Concat<axis={axis}>(a, b)")
+    onnx.save(model, tmp_path / "j.onnx")
+    assert read_network(tmp_path / "j.onnx", 30).operations[-1].out_shape == shape
+
+
 def test_a_model_fixed_to_another_tile_is_refused_with_its_tile(tmp_path: Path) -> None:
     model = written(f"y = {SAME}(image, w)")
     fix_sizes(model.graph.input[0], 48, 48)
