@@ -130,8 +130,10 @@ def place_words(raster: Raster) -> Mapping[str, str]:
     place = raster.place
     words = "none"
     if place.crs or place.transform or place.gcps:
-        code = place.crs.to_epsg() if place.crs else None
-        words = f"EPSG:{code}" if code else "a coordinate system without a code"
+        words = "no coordinate system"
+        if place.crs:
+            code = place.crs.to_epsg()
+            words = f"EPSG:{code}" if code else "a coordinate system without a code"
     if place.transform:
         corner = place.transform
         words += (

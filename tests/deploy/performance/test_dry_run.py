@@ -56,6 +56,12 @@ def test_it_shows_the_facts_of_the_header(model: Path, tmp_path: Path) -> None:
     assert (row.text["nodata"], row.text["rational polynomials"]) == ("7", "yes")
 
 
+def test_a_place_without_a_coordinate_system_is_stated_as_such(model: Path, tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", np.ones((90, 70), np.uint16), extratags=TAGS[:2])
+    words = about(tmp_path / "in.tif", model, 23).text["georeference"]
+    assert words.startswith("no coordinate system, first corner (300000, 4800000), pixels of 0.5")
+
+
 def test_its_plan_is_that_of_the_restoration(model: Path, tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.ones((90, 70), np.uint16))
     plan = about(tmp_path / "in.tif", model, 23)
