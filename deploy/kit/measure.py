@@ -109,6 +109,14 @@ def measure(options: argparse.Namespace) -> dict[str, object]:
     tile_px = kit_tile_px(options.model.parent / "host.json", options.tile)
     session = open_session(options.model, options.provider, {key: value for key, _, value in pairs})
     feed = make_feed(session, options.batch, tile_px)
+    try:
+        session.run(None, feed)
+    # onnxruntime raises a class of its own for each status code.
+    except Exception as error:
+        raise ValueError(
+            f"{options.provider} cannot run {options.model} on tiles of {tile_px} px: {error}. "
+            "Give the --tile that it accepts."
+        ) from error
     if not options.no_compare:
         compare(options.model, session, feed)
     stamps, _ = run_threads(session, feed, 1 + WARM_UP_CALLS + LATENCY_CALLS, 1, [])

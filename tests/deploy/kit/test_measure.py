@@ -4,11 +4,21 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
+import onnx
 import pytest
 
 import beers_deploy as bd
 from beers_deploy.kit import measure
 from tests.deploy.dpu.graphs import board_convbeers
+from tests.quant.simplify.networks import parsed
+
+OF_EIGHT = parsed(
+    "line = Flatten(x) y = Gemm(line, w)",
+    "float[1,1,H,W] x => float[1,4] y",
+    constants={"w": np.zeros((64, 4))},
+)
+"""A network of images of 8 x 8 pixels, whose file does not state their size."""
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: object, configuration: str = "C32B1") -> int:
@@ -84,6 +94,7 @@ def test_throughput_leaves_the_first_calls_latency_out() -> None:
         (("core.onnx",), "VitisAIExecutionProvider"),
         (("none.onnx", "--provider", "CPUExecutionProvider"), "no such file"),
         (("text.onnx", "--provider", "CPUExecutionProvider"), "cannot open text.onnx"),
+        (("line.onnx", "--provider", "CPUExecutionProvider"), "line.onnx on tiles of 16 px: "),
         (("core.onnx", "--option", "level"), "--option must be KEY=VALUE, got level"),
         (("core.onnx", "--out", "none/board.json"), "none is not a folder"),
         (("core.onnx", "--out", "text.onnx"), "must be a JSON list of runs"),
@@ -99,6 +110,7 @@ def test_what_the_owner_can_correct_is_one_sentence(
 ) -> None:
     board_convbeers(tmp_path / "core.onnx", 1, 8)
     (tmp_path / "text.onnx").write_text("no network", encoding="utf-8")
+    onnx.save_model(OF_EIGHT, tmp_path / "line.onnx")
     monkeypatch.chdir(tmp_path)
     assert run(monkeypatch, *arguments, "--tile", "16") == 2
     assert word in capsys.readouterr().err
