@@ -216,12 +216,21 @@ class Check:
         """The value with its unit and detail, formatted for a person to read."""
         unit = "" if self.unit in IN_THE_NAME else f" {self.unit}"
         # A detail may hold the name of a node of another's file: it must stay on its line of a log.
-        return f"{self.value:.4g}{unit}" + (f" ({printable(self.detail)})" if self.detail else "")
+        detail = f" ({printable(self.detail)})" if self.detail else ""
+        return f"{self.value:.{self._digits}g}{unit}{detail}"
 
     @property
     def allowed(self) -> str:
         """The limit, formatted for a person to read, such as "at most 2"."""
-        return f"{self.bound} {self.limit:.4g}"
+        return f"{self.bound} {self.limit:.{self._digits}g}"
+
+    @property
+    def _digits(self) -> int:
+        """The number of digits, 4 or more, by which a value beyond the limit differs from it."""
+        for digits in range(4, 17):
+            if self.passed or f"{self.value:.{digits}g}" != f"{self.limit:.{digits}g}":
+                return digits
+        return 17
 
     def __str__(self) -> str:
         return f"{self.name} {self.actual}, allowed {self.allowed}"

@@ -3,16 +3,19 @@ import math
 import platform
 from copy import deepcopy
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import jsonschema
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import beers_deploy as bd
 from beers_deploy.model.processor import processor_name
 from beers_deploy.performance.board import Bench
 from beers_deploy.profiles.figures import (
+    Bound,
     Check,
     Figure,
     Row,
@@ -203,6 +206,16 @@ def test_a_caption_follows_its_table() -> None:
     text = str(table)
     assert text.index("First") < text.index("What ok means.") < text.rindex("a row")
     assert "<p>What ok means.</p>" in table._repr_html_()
+
+
+@given(st.floats(1e-6, 1e6), st.floats(-1e-3, 1e-3), st.sampled_from(get_args(Bound)))
+def test_a_failed_check_shows_another_value_than_its_limit(
+    limit: float, off: float, bound: Bound
+) -> None:
+    check = Check("MAE", limit * (1 + off), limit, "ratio", bound)
+    _, shown_limit = check.allowed.rsplit(" ", 1)
+    assert check.passed or check.actual != shown_limit
+    assert float(check.actual) == pytest.approx(check.value, rel=1e-3)
 
 
 def test_a_table_with_arrays_equals_its_copy_and_no_other() -> None:
