@@ -281,8 +281,7 @@ def judged(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
     variance = dark + growth * light + square * light**2
     # Saturated pixels, those close to one, and those at the image's border have no residual.
     counts = largest_around((raw >= 1).astype(F), CLOSE) == 0
-    inside = np.zeros_like(counts)
-    inside[CLOSE:-CLOSE, CLOSE:-CLOSE] = counts[CLOSE:-CLOSE, CLOSE:-CLOSE]
+    inside = np.pad(counts[CLOSE:-CLOSE, CLOSE:-CLOSE], CLOSE)
     residual = inside * (raw - blurred) / np.sqrt(variance)
     cells, smooth = (
         sums(sums(residual, side) ** 2 / np.maximum(sums(inside, side), 1), CHECK // side)
@@ -300,7 +299,7 @@ def sums(values: np.ndarray, side: int) -> np.ndarray:
     """Return the sums of an array (H, W) over squares of `side` x `side` values, (n, m)."""
     down, across = (np.arange(0, length, side) for length in values.shape)
     by_rows = np.add.reduceat(values, down, 0, dtype=float)
-    return np.asarray(np.add.reduceat(by_rows, across, 1))
+    return np.add.reduceat(by_rows, across, 1)
 
 
 def report(blocks: np.ndarray) -> str:

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from beers_deploy.profiles.errors import counted
+
 DRAWS = 4000
 LEVEL = 0.95
 WORDS = "95 % bootstrap interval over sites"
@@ -32,17 +34,12 @@ def site_interval(
         The interval and its description; or None and the reason, if there are fewer than five
         sites.
     """
-    count = len(set(sites))
-    if count < LEAST_SITES:
-        return (
-            None,
-            f"no interval: {count} site{'s' if count > 1 else ''}, fewer than {LEAST_SITES}",
-        )
-    numbers = np.asarray(values, np.float64)
-    names = np.asarray(sites)
-    groups = [numbers[names == name] for name in np.unique(names)]
-    sums, counts = (np.array([f(group) for group in groups]) for f in (np.sum, np.size))
-    draws = generator.integers(len(groups), size=(DRAWS, len(groups)))
+    names, places = np.unique(sites, return_inverse=True)
+    if len(names) < LEAST_SITES:
+        return None, f"no interval: {counted(len(names), 'site')}, fewer than {LEAST_SITES}"
+    sums = np.bincount(places, values)
+    counts = np.bincount(places)
+    draws = generator.integers(len(names), size=(DRAWS, len(names)))
     # The sums are divided by the counts, so that a site of many images counts for them.
     means = sums[draws].sum(1) / counts[draws].sum(1)
     return percentiles(means), WORDS
