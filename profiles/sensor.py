@@ -59,14 +59,9 @@ from beers_deploy.profiles.validation import CONFIG, validated
 MAX_DRAWS = 10_000
 
 
-def _bright(fields: dict[str, Constant]) -> Constant:
-    """Return a quarter of full scale, where the noise is given by alpha and beta."""
-    full_scale = (2 ** fields["bits"].low - 1) / fields["gain_dn_per_radiance"].low
-    return Constant(full_scale / 4, "inferred", "a quarter of full scale")
-
-
-def _dark(fields: dict[str, Constant]) -> Constant:
-    return Constant(fields["radiance_1"].low / 4, "inferred", "a quarter of radiance_1")
+def _quarter(of: float, name: str) -> Constant:
+    """Return the default of a radiance, where the noise is given by alpha and beta."""
+    return Constant(of / 4, "inferred", f"a quarter of {name}")
 
 
 @dataclass(frozen=True, repr=False, config=CONFIG)
@@ -101,8 +96,14 @@ class Sensor:
         Constant,
         Limits(LEAST, MOST, single=True, hint="Give full-scale DN divided by full-scale radiance."),
     ]
-    radiance_1: Radiance = Field(default_factory=_bright)
-    radiance_0: Radiance = Field(default_factory=_dark)
+    radiance_1: Radiance = Field(
+        default_factory=lambda fields: _quarter(
+            (2 ** fields["bits"].low - 1) / fields["gain_dn_per_radiance"].low, "full scale"
+        )
+    )
+    radiance_0: Radiance = Field(
+        default_factory=lambda fields: _quarter(fields["radiance_1"].low, "radiance_1")
+    )
     snr_0: Ratio | None = None
     snr_1: Ratio | None = None
     alpha: Variance | None = None
@@ -373,9 +374,7 @@ def _stated(value: object, contrast: Constant) -> Stated:
 
 
 def same_instrument(one: Sensor, other: Sensor) -> bool:
-    """Return True if two profiles state the same numbers, and so produce the same images; names and
-    sources may differ.
-    """
+    """Return True if two profiles produce the same images; names and sources may differ."""
     return numbers_of(one) == numbers_of(other)
 
 

@@ -5,6 +5,7 @@ One configuration and one tile size are predicted layer by layer; several are sw
 cannot be tiled are predicted by the frame.
 """
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import chain
@@ -174,14 +175,12 @@ def bench_board(
         raise ModelError(
             f"{error} To predict the network by the frame, leave out {' and '.join(given)}."
         ) from error
-    swaths = list[Swath]()
+    swaths = [_swath(asked, tiling, tile_px, dn, sensor) for tile_px in asked.tiles_px]
     notes = list[str]()
-    for tile_px in asked.tiles_px:
-        swath = _swath(asked, tiling, tile_px, dn, sensor)
-        if dn is not None and sensor is not None:
-            swath, words = exposed(swath, dn, sensor, tiling)
+    if dn is not None and sensor is not None:
+        for number, whole in enumerate(swaths):
+            swaths[number], words = exposed(whole, dn, sensor, tiling)
             notes += words
-        swaths.append(swath)
     swath = swaths[0]
     targets = list({dpu.target.name: dpu.target for dpu in asked.boards}.values())
     # The paper measured the VCK190 alone: its rows belong next to no other board.
@@ -231,9 +230,9 @@ def _counted_alike(network: Network, asked: Question, swath: Swath) -> list[Row]
 
     Whole tiles with a halo are more work than the paper counts, so their time is not comparable.
     """
-    boards = {dpu.name: dpu for dpu in asked.boards if dpu.target.name == PAPER_TARGET}
-    first = next(iter(boards.values()))
-    dpu = boards.get(str(first.target.default_configuration), first)
+    boards = [dpu for dpu in asked.boards if dpu.target.name == PAPER_TARGET]
+    default = (dpu for dpu in boards if dpu.name == dpu.target.default_configuration)
+    dpu = next(default, boards[0])
     prediction = predict_network(network, dpu, swath.tile_px, asked.task, swath.step_px)
     return predicted_rows(network.name, prediction, swath)[:1]
 
@@ -244,14 +243,13 @@ def _table(
     """Join tables with titles to the one table that `bench` returns."""
     rows = list(chain.from_iterable(part for _, part in tables))
     headings = {part[0].table: title for title, part in tables if part}
-    first = rows[0].table
     errors = {dpu.target.name: dpu.value("cost", "error_left_out") for dpu in boards}
-    # Such a board's cost model is fitted to few published rates.
-    headings[first] += "".join(
-        f". Of {name} little is known: networks left out of the fit are off by {error:.0%}"
-        for name, error in errors.items()
-        if error > POOR
-    )
+    for name, error in errors.items():
+        # Such a board's cost model is fitted to few published rates.
+        if error > POOR:
+            headings[rows[0].table] += (
+                f". Of {name} little is known: networks left out of the fit are off by {error:.0%}"
+            )
     return Bench(
         inputs=(network.input,),
         rows=tuple(rows),
@@ -275,11 +273,10 @@ def fitted_words(rows: Sequence[Row]) -> list[str]:
     Returns:
         A sentence for each text other than "inside", with the names of its rows.
     """
-    ranges: dict[str, list[str]] = {}
+    ranges = defaultdict[str, list[str]](list)
     for row in rows:
-        words = row.text.get("fitted range", "inside")
-        if words != "inside":
-            ranges.setdefault(words, []).append(row.name)
+        ranges[row.text.get("fitted range", "inside")].append(row.name)
+    ranges.pop("inside", None)
     return [f"fitted range of {'; '.join(names)}: {words}" for words, names in ranges.items()]
 
 

@@ -2,6 +2,7 @@
 figures.
 """
 
+from collections import defaultdict
 from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from itertools import chain
@@ -90,14 +91,14 @@ def missing(rows: Sequence[Row]) -> list[str]:
         A line for each reason: the names of the figures, the names of their rows (unless they are
         half of all rows or more), and the reason.
     """
-    keys_of: dict[tuple[str, str], list[str]] = {}
+    keys_of = defaultdict[tuple[str, str], list[str]](list)
     for row in rows:
         for key, figure in row.figures.items():
             if figure.value is None:
-                keys_of.setdefault((figure.reason, row.name), []).append(key)
-    rows_of: dict[tuple[str, str], list[str]] = {}
+                keys_of[figure.reason, row.name].append(key)
+    rows_of = defaultdict[tuple[str, str], list[str]](list)
     for (reason, name), keys in keys_of.items():
-        rows_of.setdefault((reason, ", ".join(keys)), []).append(name)
+        rows_of[reason, ", ".join(keys)].append(name)
     lines = []
     for (reason, keys_text), names in rows_of.items():
         # If most rows lack a figure, their names are no information.
