@@ -41,8 +41,9 @@ def main() -> int:
     """
     options = arguments()
     try:
-        # A file that cannot take the run is refused before minutes are spent on it.
+        # Files that cannot be read are refused before minutes are spent on a run.
         read_runs(options.out)
+        read_power_w(options.power_file)
         entry = measure(options)
         runs = [*read_runs(options.out), entry]
         options.out.write_text(json.dumps(runs, indent=1) + "\n", encoding="utf-8")
@@ -278,11 +279,16 @@ def run_threads(
         worker.start()
     power_w: list[float] = []
     while power_files and (not power_w or workers[0].is_alive()):
-        power_w.append(sum(int(file.read_text(encoding="utf-8")) for file in power_files) / 1e6)
+        power_w.append(read_power_w(power_files))
         time.sleep(POWER_SAMPLE_S)
     for worker in workers:
         worker.join()
     return sorted(stamps), power_w
+
+
+def read_power_w(files: list[Path]) -> float:
+    """Return the power in W, summed over files that state it in microwatts."""
+    return sum(int(file.read_text(encoding="utf-8")) for file in files) / 1e6
 
 
 def throughput(stamps: list[float], batch: int) -> float:
