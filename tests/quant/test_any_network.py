@@ -151,7 +151,7 @@ def test_an_invalid_description_raises_no_other_error(
 def test_the_core_is_legal_on_the_dpu(name: str) -> None:
     dpu = load_dpu("vck190", None)
     for file in (quantized(name).host, board_model(quantized(name).core, {})):
-        assert legality(place(network_of(file, 64), dpu)).passed
+        assert legality(place(network_of(file, 64), dpu), dpu).passed
 
 
 @EACH
