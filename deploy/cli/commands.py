@@ -106,7 +106,14 @@ class Group(TyperGroup):
         self.commands = cast(Any, Commands())
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the command line as Click does, and set `results_on_stdout`."""
+        """Parse the command line as Click does, and set `results_on_stdout`.
+
+        An empty word is refused, because it would be read as the path of the working folder.
+        """
+        for before, word in pairwise(["", *args]):
+            if not word:
+                name = before if before.startswith("-") else "an argument"
+                raise typer.BadParameter(f"{name} is empty. Give a value, or leave it out.")
         # After parsing, Click stores the words in an attribute whose name differs between its
         # versions.
         self.results_on_stdout = ("--json", "-") in pairwise(args) or "--json=-" in args

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import replace
-from errno import EDQUOT, EFBIG, ENOSPC
+from errno import EDQUOT, EFBIG, ENOENT, ENOSPC
 from pathlib import Path
 from typing import Any
 
@@ -216,6 +216,9 @@ def ending(error: BaseException, command: Command) -> tuple[str, int]:
         return in_options(str(error), command.verb), 2
     if isinstance(error, MemoryError):
         return "There is not enough memory for this input. Give a smaller image or tile.", 2
+    # Of all calls of the system, only the one that asks for the working folder names no file.
+    if isinstance(error, OSError) and error.errno == ENOENT and error.filename is None:
+        return "The working folder was deleted. Change to another folder, and run this again.", 2
     if isinstance(error, OSError) and error.errno in (ENOSPC, EDQUOT, EFBIG):
         where = error.filename or "an output"
         return f"There is no space to write {where}: {error.strerror}. Free some of the disk.", 2

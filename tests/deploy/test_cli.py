@@ -85,6 +85,27 @@ def test_a_value_that_an_option_does_not_accept_is_named(words: str, reason: str
     assert refused(f"restore raw.tif out.tif {words}").endswith(f"Invalid value for {reason}")
 
 
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [(["", "out.tif"], "an argument"), (["raw.tif", "out.tif", "--self-check", ""], "--self-check")],
+)
+def test_an_empty_word_is_named_and_not_read_as_the_working_folder(
+    words: list[str], name: str
+) -> None:
+    assert refused("restore", *words).endswith(f"{name} is empty. Give a value, or leave it out.")
+
+
+def test_a_working_folder_that_was_deleted_is_no_fault_of_the_program(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "deleted"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    folder.rmdir()
+    message = refused("restore", acquisition(tmp_path / "in.tif"), "out.tif")
+    assert "The working folder was deleted" in message
+
+
 def test_version() -> None:
     assert done("--version") == f"beers-deploy {__version__}\n"
 
