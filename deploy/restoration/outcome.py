@@ -111,8 +111,8 @@ class Tally:
 
         Args:
             stored: the raw pixels (bands, h, w), in shares of full scale.
-            restored: the restored pixels (bands', h s, w s), in shares of full scale, where s is
-                the network's scale.
+            restored: the restored pixels (bands', h s, w s), in shares of full scale and rounded as
+                they are stored, where s is the network's scale.
             valid: mask of the raw pixels that are not missing; None if none is missing.
             valid_restored: mask of the restored pixels that are not missing; None if none is.
         """

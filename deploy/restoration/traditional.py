@@ -24,7 +24,7 @@ from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.prepare import Restoration, check_sensor
 from beers_deploy.restoration.radiometry import Reading, full_scale_of
 from beers_deploy.restoration.runtime import Engine
-from beers_deploy.restoration.tiles.engine import as_stored, checked_strip
+from beers_deploy.restoration.tiles.engine import as_stored, checked_strip, rounded
 from beers_deploy.restoration.tiles.rows import RestoredRow
 
 STRIP_PX = 128
@@ -145,7 +145,7 @@ class TraditionalRestoration(Restoration):
             pixels = np.where(missing, raw.astype(raster.out_dtype), pixels)
         tally = Tally.of(
             np.nan_to_num(raw.astype(np.float64)) / full_scale,
-            restored.astype(np.float64) / full_scale,
+            rounded(raster, restored).astype(np.float64) / full_scale,
             valid,
             valid,
         )

@@ -87,7 +87,10 @@ def test_a_value_that_an_option_does_not_accept_is_named(words: str, reason: str
 
 @pytest.mark.parametrize(
     ("words", "name"),
-    [(["", "out.tif"], "an argument"), (["raw.tif", "out.tif", "--self-check", ""], "--self-check")],
+    [
+        (["", "out.tif"], "an argument"),
+        (["raw.tif", "out.tif", "--self-check", ""], "--self-check"),
+    ],
 )
 def test_an_empty_word_is_named_and_not_read_as_the_working_folder(
     words: list[str], name: str

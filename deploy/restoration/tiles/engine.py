@@ -172,7 +172,8 @@ class Restorer:
         raw_shares = raw.astype(np.float64) / self.full_scale
 
         def tally_of(pixels: np.ndarray) -> Tally:
-            shares = np.nan_to_num(pixels).astype(np.float64) / self.full_scale
+            known = rounded(self.raster, np.nan_to_num(pixels))
+            shares = known.astype(np.float64) / self.full_scale
             return Tally.of(raw_shares, shares, valid_raw, valid)
 
         pixels = network_pixels = restored[:, down, across]
@@ -336,6 +337,11 @@ def checked_strip(
     return Strip(top, pixels, missing, high > full_scale, left)
 
 
+def rounded(raster: Raster, restored: np.ndarray) -> np.ndarray:
+    """Return restored pixels as whole numbers, unless the output stores floats."""
+    return restored if raster.out_dtype.kind == "f" else np.rint(restored)
+
+
 def as_stored(raster: Raster, restored: np.ndarray, full_scale: float) -> np.ndarray:
     """Convert restored pixels to the type of the output, rounded if that is an integer type.
 
@@ -347,8 +353,7 @@ def as_stored(raster: Raster, restored: np.ndarray, full_scale: float) -> np.nda
         restored: float pixels of any shape, between 0 and full scale.
         full_scale: the pixel value that is full scale.
     """
-    result = np.rint(restored) if raster.out_dtype.kind != "f" else restored
-    result = result.astype(raster.out_dtype)
+    result = rounded(raster, restored).astype(raster.out_dtype)
     nodata = raster.nodata
     # A restored pixel lies between 0 and full scale, so another nodata value is never hit.
     if nodata is not None and 0 <= nodata <= full_scale:

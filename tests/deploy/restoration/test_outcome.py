@@ -1,5 +1,8 @@
 """Tests of warnings about a result: 3 % more light gives one, shipped networks give none."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +12,7 @@ import beers_deploy as bd
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.outcome import Tally
-from tests.deploy.restoration.runs import simulated
+from tests.deploy.restoration.runs import restored, simulated
 
 SENSOR = Sensor.load("pleiades-degraded")
 
@@ -68,6 +71,24 @@ def test_parts_add_up_to_the_whole() -> None:
     total = tally(image, image)
     assert parts.dark == total.dark > 0
     assert parts.mean_bound == pytest.approx(total.mean_bound)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"network": "convbeers-xs-int8"}, {"method": "traditional", "sensor": SENSOR}],
+    ids=["network", "traditional"],
+)
+def test_the_share_at_the_ends_is_that_of_the_stored_numbers(
+    options: dict[str, Any], tmp_path: Path
+) -> None:
+    """A result of 0.3 DN is stored as 0."""
+    raw = np.ones((64, 64), np.uint16)
+    # A restoration undershoots around the square.
+    raw[20:40, 20:40] = 2000
+    result, row = restored(tmp_path, raw, force=True, **options)
+    ends = (result == 0) & (raw > 0)
+    assert 0 < ends.mean() < 1
+    assert row.figures["results at ends"].value == pytest.approx(100 * ends.mean())
 
 
 @settings(max_examples=5)
