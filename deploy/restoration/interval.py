@@ -77,9 +77,7 @@ class HalfWidths:
             top = max(start + first - CONTEXT_PX, 0)
             bottom = min(start + end + CONTEXT_PX, raster.height_px)
             pixels = self.restored(band, top, bottom)
-            valid = np.ones(pixels.shape, bool)
-            if raster.may_miss:
-                valid = ~raster.missing(self.source.read(top, bottom))[band]
+            valid = ~raster.missing(self.source.read(top, bottom))[band]
             widths = self.bands[band].of(pixels, valid)
             parts.append(widths[start + first - top : start + end - top])
         return np.concatenate(parts)

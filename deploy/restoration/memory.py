@@ -34,10 +34,10 @@ def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
             decoding are part of the memory in use.
     """
     raster = source.raster
-    row_px = raster.bands * raster.width_px
+    strip_px = plan.strip_rows_px * raster.bands * raster.width_px
     # `may_miss` adds one byte a pixel: the flag of a missing one.
-    strip_bytes = plan.strip_rows_px * row_px * (raster.dtype.itemsize + raster.may_miss)
-    flags = plan.strip_rows_px * row_px * raster.may_miss
+    flags = strip_px * raster.may_miss
+    strip_bytes = strip_px * raster.dtype.itemsize + flags
     source_bytes = 0 if begun else strip_bytes + source.held_bytes(plan.strip_rows_px)
     bands, _, width_px = plan.out_shape
     row_values = plan.tile_shape[0] * plan.scale * bands * width_px

@@ -164,10 +164,9 @@ def _corners(file: Any) -> list[tuple[float, float]]:
     """Return longitude and latitude, in degrees, of the four corners of an open image,
     counter-clockwise from the upper left one.
     """
-    places = [(0, 0), (0, file.height), (file.width, file.height), (file.width, 0)]
-    a, b, c, d, e, f = file.transform[:6]
-    x = [a * column + b * row + c for column, row in places]
-    y = [d * column + e * row + f for column, row in places]
+    rows = [0, file.height, file.height, 0]
+    columns = [0, 0, file.width, file.width]
+    x, y = file.xy(rows, columns, offset="ul")
     longitudes, latitudes = transform(file.crs, LONGITUDE_LATITUDE, x, y)
     return list(zip(longitudes, latitudes, strict=True))
 

@@ -6,6 +6,7 @@ is restored. The same command, resumed or not, therefore replaces the same pixel
 """
 
 import logging
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -42,14 +43,9 @@ ONE_SIDED = 1e-3
 """Weight of a direction with a valid neighbour on one side only, relative to one with two."""
 ASLANT = 1e-6
 """Weight of the diagonals. They matter only where a faulty column crosses a faulty row."""
-WAYS = (
-    ((0, -1), (0, 1), 1.0),
-    ((-1, 0), (1, 0), 1.0),
-    ((-1, -1), (1, 1), ASLANT),
-    ((-1, 1), (1, -1), ASLANT),
-)
-"""For each direction, the offsets in rows and columns to either side, and the weight: along a row,
-along a column, diagonal.
+WAYS = {(0, 1): 1.0, (1, 0): 1.0, (1, 1): ASLANT, (1, -1): ASLANT}
+"""The weight of each direction, by its offset in rows and columns: along a row, along a column,
+diagonal. Pixels on both sides count.
 """
 
 
@@ -156,12 +152,10 @@ def find_faults(source: Source, name: str) -> FaultList:
                     f"{name} has too many faulty pixels: more than {MANY:.0%}, apart from those of "
                     "faulty columns and rows. List the faulty pixels in a file."
                 )
-    columns = {(fault.column, fault.band) for fault in lines if fault.row < 0}
-    rows = {(fault.row, fault.band) for fault in lines if fault.column < 0}
     alone = {
         pixel
         for pixel in pixels
-        if (pixel.column, pixel.band) not in columns and (pixel.row, pixel.band) not in rows
+        if lines.isdisjoint((replace(pixel, row=-1), replace(pixel, column=-1)))
     }
     return FaultList(tuple(sorted(lines | alone)))
 
@@ -215,19 +209,16 @@ class FixedSource:
             return self._source.read(start, stop)
         top = max(start - REACH_PX, 0)
         end = min(stop + REACH_PX, raster.height_px)
-        stored = self._source.read(top, end)
-        missing = raster.missing(stored) if raster.may_miss else np.zeros(stored.shape, bool)
+        stored = self._source.read(top, end).copy()
+        known = ~raster.missing(stored)
         faulty = self.faults.mask(raster, top, end)
-        pixels = np.ma.getdata(stored).copy()
-        targets = faulty & ~missing
+        targets = faulty & known
         # The rows around are read as neighbours only.
         targets[:, : start - top] = targets[:, stop - top :] = False
-        for plane, bad, valid in zip(pixels, targets, ~faulty & ~missing, strict=True):
+        pixels = np.ma.getdata(stored)
+        for plane, bad, valid in zip(pixels, targets, ~faulty & known, strict=True):
             replace_pixels(plane, bad, valid, raster.nodata)
-        within = slice(start - top, stop - top)
-        if isinstance(stored, np.ma.MaskedArray):
-            return np.ma.MaskedArray(pixels[:, within], mask=np.ma.getmaskarray(stored)[:, within])
-        return pixels[:, within]
+        return stored[:, start - top : stop - top]
 
     def read_mask(self, start: int, stop: int) -> np.ndarray:
         """Read rows `start` to `stop` (excluded) of the image's mask or alpha, (rows, width)."""
@@ -239,9 +230,8 @@ class FixedSource:
         """
         raster = self.raster
         row_bytes = raster.bands * raster.width_px * (raster.dtype.itemsize + 4)
-        return (
-            self._source.held_bytes(rows_px + 2 * REACH_PX) + (rows_px + 2 * REACH_PX) * row_bytes
-        )
+        around_px = rows_px + 2 * REACH_PX
+        return self._source.held_bytes(around_px) + around_px * row_bytes
 
 
 def replace_pixels(
@@ -263,10 +253,10 @@ def replace_pixels(
     weights = np.zeros(len(places))
     closest = np.zeros(len(places))
     distance = np.full(len(places), np.inf)
-    for one, other, weight in WAYS:
-        (left, near), (right, far) = (
-            _nearest(plane, valid, places, np.array(side)) for side in (one, other)
-        )
+    for way, weight in WAYS.items():
+        side = np.array(way)
+        left, near = _nearest(plane, valid, places, -side)
+        right, far = _nearest(plane, valid, places, side)
         both = np.isfinite(near) & np.isfinite(far)
         either = np.isfinite(near) | np.isfinite(far)
         single = np.where(near <= far, left, right)

@@ -109,10 +109,7 @@ def as_floats(raster: Raster, stored: np.ndarray) -> np.ndarray:
     """
     with np.errstate(over="ignore"):
         pixels = np.ma.getdata(stored).astype(np.float32)
-    if raster.dtype.kind == "f":
-        pixels[~np.isfinite(pixels)] = np.nan
-    if raster.may_miss:
-        pixels[raster.missing(stored)] = np.nan
+    pixels[raster.missing(stored) | ~np.isfinite(pixels)] = np.nan
     return pixels
 
 

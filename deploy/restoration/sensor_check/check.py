@@ -191,9 +191,7 @@ def band_windows(source: Source) -> list[list[np.ndarray]]:
     by_band: list[list[np.ndarray]] = [[] for _ in range(raster.bands)]
     for down in _spread(raster.height_px):
         rows = source.read(down.start, down.stop)
-        values = np.ma.getdata(rows)
-        if raster.may_miss:
-            values = np.where(raster.missing(rows), 0, values)
+        values = np.where(raster.missing(rows), 0, np.ma.getdata(rows))
         for across in _spread(raster.width_px):
             for windows, window in zip(by_band, values[:, :, across], strict=True):
                 windows.append(window)

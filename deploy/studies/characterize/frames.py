@@ -197,15 +197,13 @@ def read_raw(path: Path) -> np.ndarray:
             f"{path} must have one band, because each band has its own sensor, but it has "
             f"{raster.bands} bands. Extract one band."
         )
-    pixels: np.ndarray = np.ma.getdata(rows)[0]
-    if raster.may_miss:
-        missing = raster.missing(rows)[0]
-        if missing.all():
-            raise ImageError(
-                f"{path} has no pixels with values, only NaN or nodata. Check that it is the right "
-                "file."
-            )
-        pixels = np.where(missing, 0, pixels)
+    missing = raster.missing(rows)[0]
+    if missing.all():
+        raise ImageError(
+            f"{path} has no pixels with values, only NaN or nodata. Check that it is the right "
+            "file."
+        )
+    pixels = np.where(missing, 0, np.ma.getdata(rows)[0])
     if (
         (pixels.dtype.kind == "f" and (pixels != np.rint(pixels)).any())
         or pixels.min() < 0
