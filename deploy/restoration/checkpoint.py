@@ -10,12 +10,14 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, dataclass
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Gt
+from pydantic import StrictInt, TypeAdapter
 
 from beers_deploy.model.io.files import require_regular
 from beers_deploy.model.io.lock import part_folder
@@ -42,9 +44,13 @@ class FinishedRow:
         tally: counts and sums over these pixels and their raw ones.
     """
 
-    rows_px: int
+    rows_px: Annotated[StrictInt, Gt(0)]
     sha256: str
     tally: Tally
+
+
+FINISHED = TypeAdapter(list[FinishedRow])
+"""Checks the entries of a journal, which may be forged."""
 
 
 def journal_text(job: Mapping[str, object], finished: Sequence[FinishedRow]) -> str:
@@ -56,13 +62,6 @@ def journal_text(job: Mapping[str, object], finished: Sequence[FinishedRow]) -> 
     """
     content = {"job": job, "finished": [asdict(row) for row in finished]}
     return json.dumps(content | {"sha256": _digest(content)})
-
-
-def _possible(row: FinishedRow) -> bool:
-    """Return True if counts are integers, and no count or sum is negative."""
-    tally = zip(astuple(row.tally), astuple(Tally()), strict=True)
-    numbers = all(isinstance(value, int | type(zero)) and value >= 0 for value, zero in tally)
-    return numbers and isinstance(row.rows_px, int) and row.rows_px > 0
 
 
 def _digest(content: Mapping[str, object]) -> str:
@@ -218,12 +217,10 @@ class Checkpoint:
             document: Any = read_json(path)
             content: dict[str, Any] = dict(document)
             is_whole = content.pop("sha256") == _digest(content)
-            finished = [
-                FinishedRow(**row | {"tally": Tally(**row["tally"])}) for row in content["finished"]
-            ]
+            finished = FINISHED.validate_python(content["finished"])
             ends = list(accumulate(row.rows_px for row in finished))
             planned = not self._row_ends or ends == self._row_ends[: len(ends)]
-            inside = max(ends, default=0) <= self.shape[1] and all(map(_possible, finished))
+            inside = max(ends, default=0) <= self.shape[1]
             if is_whole and content["job"] == self.job and planned and inside:
                 return finished
         raise OptionError(
@@ -240,10 +237,10 @@ class Checkpoint:
         top = 0
         for row in finished:
             digest = hashlib.sha256()
-            with suppress(OSError), (self.folder / "rows.raw").open("rb") as stream:
+            # A file that was cut off holds no whole row of pixels.
+            with suppress(OSError, ValueError):
                 for band in range(self.shape[0]):
-                    stream.seek(self._offset(band, top))
-                    digest.update(stream.read(row.rows_px * self.shape[2] * self.dtype.itemsize))
+                    digest.update(self.read(band, top, top + row.rows_px).data)
             if digest.hexdigest() != row.sha256:
                 break
             matching.append(row)

@@ -6,11 +6,13 @@ scale. Small departures give a warning. Departures that no restoration has are r
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import astuple, dataclass, replace
 from operator import add
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge
+from pydantic import StrictFloat, StrictInt
 
 from beers_deploy.model.family import RANGES
 from beers_deploy.profiles.errors import ImageError, printable
@@ -50,6 +52,11 @@ LEAST_SPREAD = 1e-6
 """Standard deviation, as a share of full scale, up to which an image counts as constant."""
 
 
+Count = Annotated[StrictInt, Ge(0)]
+Sum = Annotated[StrictFloat | StrictInt, Ge(0)]
+"""The numbers of a tally, which pydantic checks if they are read from a file."""
+
+
 @dataclass(frozen=True)
 class Tally:
     """Counts and sums over raw pixels and their results, the restored pixels, without missing ones.
@@ -81,23 +88,23 @@ class Tally:
         blank: number of raw pixels in squares of 8 x 8 that are exactly 0.
     """
 
-    valid_results: int = 0
-    clipped: int = 0
-    at_ends: int = 0
-    compared: int = 0
-    before: float = 0.0
-    before_squared: float = 0.0
-    after: float = 0.0
-    after_squared: float = 0.0
-    tiles: int = 0
-    runs: int = 0
-    brightened: int = 0
-    change_squared: float = 0.0
-    network_at_ends: int = 0
-    network_after: float = 0.0
-    network_after_squared: float = 0.0
-    dark: int = 0
-    blank: int = 0
+    valid_results: Count = 0
+    clipped: Count = 0
+    at_ends: Count = 0
+    compared: Count = 0
+    before: Sum = 0.0
+    before_squared: Sum = 0.0
+    after: Sum = 0.0
+    after_squared: Sum = 0.0
+    tiles: Count = 0
+    runs: Count = 0
+    brightened: Count = 0
+    change_squared: Sum = 0.0
+    network_at_ends: Count = 0
+    network_after: Sum = 0.0
+    network_after_squared: Sum = 0.0
+    dark: Count = 0
+    blank: Count = 0
 
     @classmethod
     def of(
@@ -117,10 +124,11 @@ class Tally:
             valid_restored: mask of the restored pixels that are not missing; None if none is.
         """
         alike = len(stored) == len(restored)
-        between = (stored > 0) & (stored < 1)
-        scale = restored.shape[1] // stored.shape[1]
-        within = between.repeat(scale, axis=1).repeat(scale, axis=2) if alike else True
-        at_ends = ((restored <= 0) | (restored >= 1)) & within
+        at_ends = (restored <= 0) | (restored >= 1)
+        if alike:
+            scale = restored.shape[1] // stored.shape[1]
+            between = (stored > 0) & (stored < 1)
+            at_ends &= between.repeat(scale, axis=1).repeat(scale, axis=2)
         before = stored
         after = restored
         if valid is not None and valid_restored is not None:
@@ -199,12 +207,10 @@ class Tally:
     def spreads(self) -> tuple[float, float]:
         """The standard deviation of the raw pixels and of the results, in shares of full scale."""
         before, after = self.means
-        before_square = self.before_squared / max(self.compared, 1)
-        after_square = self.after_squared / max(self.valid_results, 1)
         # Rounding may leave the mean square below the square of the mean.
-        return math.sqrt(max(before_square - before**2, 0)), math.sqrt(
-            max(after_square - after**2, 0)
-        )
+        variance_before = max(self.before_squared / max(self.compared, 1) - before**2, 0)
+        variance_after = max(self.after_squared / max(self.valid_results, 1) - after**2, 0)
+        return math.sqrt(variance_before), math.sqrt(variance_after)
 
     @property
     def flat(self) -> bool:
@@ -215,7 +221,7 @@ class Tally:
         return before > LEAST_SPREAD and after < FLAT * before
 
     @property
-    def figures(self) -> Mapping[str, Figure]:
+    def figures(self) -> dict[str, Figure]:
         """The figures of every run, by name: raw pixels above full scale, results at 0 or full
         scale, and the change of the mean.
         """
@@ -230,6 +236,11 @@ class Tally:
         }
 
     @property
+    def nearly_all_clipped(self) -> bool:
+        """True if nearly all raw pixels are above full scale."""
+        return self.clipped > MANY_AT_ENDS * max(self.compared, 1)
+
+    @property
     def doubts(self) -> list[str]:
         """The warnings on an implausible result, one clause each; empty for a plausible one. They
         look at the network's results before the consistency step.
@@ -239,7 +250,7 @@ class Tally:
         # a network that does not fit.
         network = self.network
         before = "before the consistency step, " if self.change_squared else ""
-        if self.clipped > MANY_AT_ENDS * max(self.compared, 1):
+        if self.nearly_all_clipped:
             clauses.append(f"{self.clipped} pixels of the image, nearly all, are above full scale")
         if network.share_at_ends > SOME_AT_ENDS:
             share = f"{network.share_at_ends:.0%} of the results"
@@ -269,12 +280,12 @@ class Tally:
         """
         network = self.network
         impossible = (
-            network.share_at_ends > MANY_AT_ENDS or abs(network.moved) > FAR or network.flat
+            network.share_at_ends > MANY_AT_ENDS
+            or abs(network.moved) > FAR
+            or network.flat
+            or self.nearly_all_clipped
         )
-
-        if self.valid_results >= FEW and (
-            impossible or self.clipped > MANY_AT_ENDS * max(self.compared, 1)
-        ):
+        if self.valid_results >= FEW and impossible:
             raise ImageError(
                 f"{name} has no plausible restoration: "
                 f"{printable('; '.join(self.doubts))}. Check `full_scale`, check the network with "
