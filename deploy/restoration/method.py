@@ -16,7 +16,7 @@ from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND, TILE_PX
 from beers_deploy.restoration.plan import Plan, make_plan
-from beers_deploy.restoration.runtime import AtFirstCall, Infer, open_runtime
+from beers_deploy.restoration.runtime import Infer, at_first_call, open_runtime
 from beers_deploy.restoration.steps import Around, exposed_networks
 from beers_deploy.restoration.tiles.rows import restore_floats
 
@@ -73,4 +73,4 @@ def network_restore(
 
 
 def _opened(model: onnx.ModelProto) -> Infer:
-    return AtFirstCall(partial(open_runtime, "onnxruntime", model, 0))
+    return at_first_call(partial(open_runtime, "onnxruntime", model, 0))

@@ -30,9 +30,9 @@ from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Plan, Span, TilePlace, Tiles, plan_for
 from beers_deploy.restoration.radiometry import FullScale, Reading, full_scale_of
 from beers_deploy.restoration.runtime import (
-    AtFirstCall,
     Engine,
     Infer,
+    at_first_call,
     infer_on,
     open_runtime,
     tiles_at_once,
@@ -111,9 +111,9 @@ class Restoration(ABC):
             The next restored rows of all bands.
         """
 
-    @abstractmethod
-    def watch_memory(self, done: int, total: int) -> None:
-        """Check the memory again, once, at the tick after which the use of memory is steady.
+    def watch_memory(self, done: int, total: int) -> None:  # noqa: B027 - few methods need it
+        """Check the memory again, once, at the tick after which the use of memory is steady, unless
+        `prepare` has checked the memory of every tick.
 
         Args:
             done: the number of ticks of this run so far.
@@ -123,13 +123,13 @@ class Restoration(ABC):
             MachineError: the memory in use and the rows to come exceed the memory that is allowed.
         """
 
-    @abstractmethod
     def figures(self, tally: Tally) -> dict[str, Figure]:
         """Return the figures of a finished run by name, for its row of results.
 
         Args:
             tally: counts and sums over the image and its result.
         """
+        return tally.figures
 
 
 class Pipeline(Protocol):
@@ -316,7 +316,7 @@ def _opener(
     def open_here(model: onnx.ModelProto) -> Infer:
         if model is first_model:
             return first
-        return AtFirstCall(partial(open_runtime, engine.runtime, model, threads, at_once))
+        return at_first_call(partial(open_runtime, engine.runtime, model, threads, at_once))
 
     return open_here, at_once, runtime
 

@@ -5,7 +5,7 @@ results.
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib.metadata import version
 from threading import Lock, get_ident
 from typing import Any, Literal
@@ -225,23 +225,23 @@ def session_threads(threads: int, at_once: int) -> int:
     return (threads or os.cpu_count() or 1) - at_once + 1 if at_once > 1 else threads
 
 
-class AtFirstCall:
-    """A network that is opened when it is first run, and stays open. Versions of a network for
-    other exposures are opened in this way, because few images need all of them.
+def at_first_call(open_network: Callable[[], tuple[Infer, str]]) -> Infer:
+    """Return a network that is opened when it is first run, and stays open. Versions of a network
+    for other exposures are opened in this way, because few images need all of them.
+
+    Args:
+        open_network: returns the network ready to run, and the name of the runtime.
     """
+    opened = cache(open_network)
+    opening = Lock()
 
-    def __init__(self, open_network: Callable[[], tuple[Infer, str]]) -> None:
-        self._open = open_network
-        self._infer: Infer | None = None
-        self._lock = Lock()
-
-    def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Run the network on (1, C, h, w) float32 in [0, 1], and return its result."""
+    def infer(image: np.ndarray) -> np.ndarray:
         # Without the lock each thread would open a network of its own.
-        with self._lock:
-            if self._infer is None:
-                self._infer, _ = self._open()
-        return self._infer(image)
+        with opening:
+            network, _ = opened()
+        return network(image)
+
+    return infer
 
 
 @dataclass(frozen=True)

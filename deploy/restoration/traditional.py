@@ -13,10 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beers_deploy.model.progress import Steps, steps
+from beers_deploy.model.progress import steps
 from beers_deploy.model.raster.source import Source, strips
 from beers_deploy.model.traditional.pipeline import TraditionalPipeline, restore_strips
-from beers_deploy.profiles.figures import Figure
 from beers_deploy.restoration.bands import by_band
 from beers_deploy.restoration.cluster import Cluster
 from beers_deploy.restoration.memory import check_memory
@@ -80,24 +79,16 @@ class TraditionalRestoration(Restoration):
             yield self._stored(torch.stack(bands).numpy(), top)
             top += rows_px
 
-    def watch_memory(self, done: int, total: int) -> None:
-        """Check nothing, because `prepare` has checked the memory that every strip needs."""
-
-    def figures(self, tally: Tally) -> dict[str, Figure]:
-        """Return the figures of a finished run by name: those of its tally, which counts and sums
-        raw and restored pixels.
-        """
-        return dict(tally.figures)
-
     def _to_dn(self, band: int) -> np.float32:
         """Return the digital number of the sensor for a pixel value of 1."""
         return np.float32(self.pipelines[band].degraded.max_dn / self.scale.value)
 
-    def read(self, band: int) -> Iterator[Tensor]:
+    def read(self, band: int, tick: Callable[[int], object] = lambda _: None) -> Iterator[Tensor]:
         """Read one band of the raw image from the top, `STRIP_PX` rows at a time.
 
         Args:
             band: the number of the band, from 0.
+            tick: called with the number of rows of each strip when the next one is requested.
 
         Yields:
             Strips (rows, width) float32 in digital numbers of the sensor, NaN where missing.
@@ -116,6 +107,7 @@ class TraditionalRestoration(Restoration):
             if strip.missing is not None:
                 dn[strip.missing[band]] = np.nan
             yield torch.from_numpy(dn)
+            tick(stop - start)
 
     def fitted(self) -> "TraditionalRestoration":
         """Return this restoration with the strength of the deconvolution fitted to the image.
@@ -125,7 +117,7 @@ class TraditionalRestoration(Restoration):
         """
         with steps("measuring noise and contrast", len(self.pipelines) * self.ticks(0)) as bar:
             pipelines = [
-                pipeline.fitted_to(_counted(self.read(band), bar))
+                pipeline.fitted_to(self.read(band, bar.advance))
                 for band, pipeline in enumerate(self.pipelines)
             ]
         return replace(self, pipelines=tuple(pipelines))
@@ -150,13 +142,6 @@ class TraditionalRestoration(Restoration):
             valid,
         )
         return RestoredRow(pixels, tally)
-
-
-def _counted(strips_read: Iterator[Tensor], bar: Steps) -> Iterator[Tensor]:
-    """Yield strips as they come, and report the rows of each when the next one is requested."""
-    for strip in strips_read:
-        yield strip
-        bar.advance(strip.shape[0])
 
 
 @dataclass(frozen=True)
