@@ -1,6 +1,7 @@
 """`evaluate`: several restorations on the same pairs, measured by the same instruments."""
 
 import logging
+import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
@@ -146,8 +147,6 @@ def evaluate(
         list_images(Path(images))
     from beers_deploy.restoration.steps import Around
     from beers_deploy.studies.evaluation.calibrate import calibrate_network, network_to_calibrate
-    from beers_deploy.studies.evaluation.compression import check_rates
-    from beers_deploy.studies.evaluation.pairs import check_brightness
     from beers_deploy.studies.evaluation.run import run_evaluation
 
     stored, in_memory = _stored_or_given(pairs)
@@ -156,9 +155,9 @@ def evaluate(
     rates = list[float]()
     if bits_per_pixel is not None:
         refuse_with("`methods` degraded", bits_per_pixel=len(named) == 1)
-        rates = check_rates(
-            numbers_of("bits_per_pixel", bits_per_pixel, "1,2,3"), sensors[0].nominal().bits
-        )
+        rates = numbers_of("bits_per_pixel", bits_per_pixel, sensors[0].nominal().bits, "1,2,3")
+    # All scenes are seen in their own light first.
+    factors = dict.fromkeys([1.0, *numbers_of("brightness", brightness, 1, "0.25,0.05")])
     source = None if calibrate is None else network_to_calibrate(named, Path(calibrate))
     table = run_evaluation(
         methods=named,
@@ -167,7 +166,7 @@ def evaluate(
         folder=stored,
         given=in_memory,
         lpips=path_or_none(lpips),
-        factors=check_brightness(numbers_of("brightness", brightness, "0.25,0.05")),
+        factors=list(factors),
         rates=rates,
         sweep=sweep,
         strict=strict,
@@ -195,20 +194,26 @@ def named_methods(methods: Methods) -> dict[str, Any]:
     return {name.strip(): name.strip() for name in ("degraded", *names)}
 
 
-def numbers_of(name: str, value: Factors, example: str) -> tuple[float, ...]:
-    """Return the numbers of an option, which are numbers or text with commas.
+def numbers_of(name: str, value: Factors, most: float, example: str) -> list[float]:
+    """Return the numbers of an option, which are numbers or text with commas, each once.
 
     Args:
         name: the name of the option.
         value: its value.
+        most: the largest number that is accepted; all must be above 0.
         example: a valid value, for the error.
     """
     try:
-        return tuple(map(float, listed(value)))
-    except (TypeError, ValueError) as error:
+        numbers = list(dict.fromkeys(map(float, listed(value))))
+    except (TypeError, ValueError):
+        # NaN lies within no limits, so the message below covers words as well.
+        numbers = [math.nan]
+    if not all(0 < number <= most for number in numbers):
         raise OptionError(
-            f"`{name}` must be numbers separated by commas, such as {example}, got {value!r}."
-        ) from error
+            f"`{name}` must be numbers above 0 and at most {most:g}, separated by commas, such as "
+            f"{example}, got {value!r}."
+        )
+    return numbers
 
 
 def _stored_or_given(pairs: "Pairs | None") -> "tuple[Path | None, Sequence[Pair] | None]":

@@ -150,16 +150,24 @@ def restore(
     from beers_deploy.restoration.steps import Around
 
     path = _file_of(image)
-    _refuse_without_effect(options, method, path, dry_run and out is None)
+    writes_none = dry_run and out is None
+    _refuse_without_effect(options, method, path, writes_none)
     if path is not None:
         require_image_file(path)
     output = None
     # A dry run refuses the outputs that the run would refuse.
-    if path is not None and not (dry_run and out is None):
-        how: dict[str, Any] = {"compression": compression, "cog": cog, "resume": resume}
-        how["interval"] = interval
-        how["self_check"] = path_or_none(self_check)
-        output = _output(out, (stac, view), overwrite, fix_detectors or "", **how)
+    if path is not None and not writes_none:
+        output = _output(
+            out,
+            (stac, view),
+            overwrite,
+            fix_detectors or "",
+            compression=compression,
+            cog=cog,
+            resume=resume,
+            interval=interval,
+            self_check=path_or_none(self_check),
+        )
     sensors = sensors_of(sensor)
     unknown = is_unknown(sensors)
     if interval is not None:

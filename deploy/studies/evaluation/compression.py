@@ -14,7 +14,7 @@ smooths too much, because much of the error is detail and noise that the codec r
 shares are tried, and each image is restored with the share that is best on the other sites.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from io import BytesIO
 
@@ -23,7 +23,7 @@ from PIL import Image
 
 from beers_deploy.model.metrics.fidelity import fidelity_db
 from beers_deploy.model.progress import steps
-from beers_deploy.profiles.errors import OptionError, counted
+from beers_deploy.profiles.errors import counted
 from beers_deploy.profiles.figures import Row, measured
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.studies.evaluation.methods import DEGRADED, Method
@@ -63,26 +63,6 @@ class Decompressed:
 
     dn: np.ndarray
     rate: float
-
-
-def check_rates(rates: Iterable[float], bits: int) -> list[float]:
-    """Check the compression rates that a user gives, and return them without duplicates.
-
-    Args:
-        rates: the sizes to which images are compressed, in bits per pixel.
-        bits: the number of bits of the sensor's digital numbers.
-
-    Raises:
-        OptionError: a rate is not above 0 and at most the bits of the sensor.
-    """
-    checked = list(dict.fromkeys(rates))
-    for rate in checked:
-        if not 0 < rate <= bits:
-            raise OptionError(
-                f"`bits_per_pixel` must be rates above 0 and at most the {bits} bits of the "
-                f"sensor, but one is {rate:g}. Give rates such as 1,2,3."
-            )
-    return checked
 
 
 def decompressed(dn: np.ndarray, rate: float, bits: int) -> Decompressed:

@@ -15,7 +15,7 @@ from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.training.patches import pair_files
-from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.instrument import MAX_DN, Instrument
 from beers_deploy.profiles.sensor import Sensor
 
@@ -98,26 +98,6 @@ def table_at(brightness: float, name: str) -> str:
         name: the name of the same table on scenes that are not dimmed.
     """
     return name if brightness == 1 else f"{name}, radiance x {brightness:g}"
-
-
-def check_brightness(brightness: Iterable[float]) -> list[float]:
-    """Check the factors of radiance that a user gives, and return 1 and the others without
-    duplicates.
-
-    Args:
-        brightness: the factors by which the radiance of scenes is multiplied.
-
-    Raises:
-        OptionError: a factor is not above 0 and at most 1.
-    """
-    factors = list(dict.fromkeys((1.0, *brightness)))
-    for factor in factors:
-        if not 0 < factor <= 1:
-            raise OptionError(
-                "`brightness` must be factors of radiance above 0 and at most 1, but one is "
-                f"{factor:g}. Give factors such as 1,0.25,0.05."
-            )
-    return factors
 
 
 def simulate_pairs(

@@ -6,7 +6,6 @@ from rasterio.io import MemoryFile
 from rasterio.transform import Affine
 
 from beers_deploy.model.metrics.fidelity import psnr_db
-from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.restoration.method import Restore
 from beers_deploy.studies.evaluation.compression import (
@@ -14,7 +13,6 @@ from beers_deploy.studies.evaluation.compression import (
     LOSSLESS,
     SHARES,
     Trial,
-    check_rates,
     decompressed,
     run_compression,
     try_method,
@@ -174,10 +172,3 @@ def test_there_is_a_row_for_each_method_and_rate_but_the_input() -> None:
     rates = [rows[2].figures[key].value or 0 for key in ("restored", "raw")]
     assert 0 < rates[0] < rates[1] < 12
     assert run_compression(methods, [pair_of("a", 0)], SENSOR, [], 0) == []
-
-
-@pytest.mark.parametrize("rate", [0.0, 12.5, float("nan")])
-def test_a_rate_that_no_code_has_is_refused(rate: float) -> None:
-    assert check_rates([2, 12, 2], 12) == [2, 12]
-    with pytest.raises(OptionError, match="above 0 and at most the 12 bits of the sensor"):
-        check_rates([1, rate], 12)

@@ -11,7 +11,7 @@ from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.studies.evaluation.compression import GAIN, LOSSLESS
 from beers_deploy.studies.evaluation.methods import Method
 from beers_deploy.studies.evaluation.run import strip_of
-from beers_deploy.verbs.evaluate import evaluate
+from beers_deploy.verbs.evaluate import evaluate, numbers_of
 from beers_deploy.verbs.simulate import simulate
 from tests.deploy.command_line import done
 from tests.deploy.documents import figures_of, valid
@@ -21,6 +21,11 @@ from tests.deploy.studies.evaluation.small_pairs import (
     pair,
     write_pairs,
 )
+
+
+@pytest.fixture(autouse=True)
+def _few_targets(monkeypatch: pytest.MonkeyPatch) -> None:
+    few_targets(monkeypatch)
 
 
 def test_strips_show_every_method_and_black_below_the_reference() -> None:
@@ -34,8 +39,7 @@ def test_strips_show_every_method_and_black_below_the_reference() -> None:
     assert errors[:, :side].max() == 255
 
 
-def test_the_command_on_a_folder_of_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    few_targets(monkeypatch)
+def test_the_command_on_a_folder_of_pairs(tmp_path: Path) -> None:
     folder = write_pairs(tmp_path / "pairs", [pair("a_1.tif", 1), pair("b_1.tif", 2)])
     files = "--json", tmp_path / "e.json", "--out", tmp_path / "out"
     done("evaluate --methods traditional-fast --bits-per-pixel 6 --pairs", folder, *files)
@@ -68,16 +72,18 @@ def test_no_pair_at_all_is_refused() -> None:
         evaluate(methods=["degraded"], pairs=[])
 
 
-@pytest.mark.parametrize("brightness", [(0.0,), (1.5,), (float("nan"),)])
-def test_a_brightness_out_of_range_is_refused(brightness: tuple[float, ...]) -> None:
-    with pytest.raises(OptionError, match=r"`brightness` .* above 0 and at most 1"):
-        evaluate(methods=["degraded"], brightness=brightness)
+@pytest.mark.parametrize("number", [0.0, 12.5, float("nan")])
+@pytest.mark.parametrize(("option", "most"), [("brightness", 1), ("bits_per_pixel", 12)])
+def test_a_number_out_of_range_is_refused(number: float, option: str, most: int) -> None:
+    with pytest.raises(OptionError, match=f"`{option}` .* above 0 and at most {most},"):
+        evaluate(methods=["wiener"], **{option: (1, number)})
 
 
-def test_the_command_at_two_brightnesses_on_photographs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    few_targets(monkeypatch)
+def test_a_number_that_is_given_twice_counts_once() -> None:
+    assert numbers_of("bits_per_pixel", "2,12,2", 12, "1,2,3") == [2, 12]
+
+
+def test_the_command_at_two_brightnesses_on_photographs(tmp_path: Path) -> None:
     scene = np.random.default_rng(0).integers(200, 3000, (270, 300)).astype(np.uint16)
     write_tiff(tmp_path / "scenes" / "zebra_DJI_0005.tif", scene)
     write_tiff(tmp_path / "scenes" / "zebra_DJI_0013.tif", scene[::-1])
