@@ -32,6 +32,8 @@ from tests.quant.tiling.small_networks import (
     plain_int8_unet,
 )
 
+pytestmark = pytest.mark.usefixtures("unchecked")
+
 SIZE = 141, 107
 
 

@@ -17,6 +17,8 @@ from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import names, stop_after
 from tests.model.raster import formats as images
 
+pytestmark = pytest.mark.usefixtures("unchecked")
+
 cogeo: Any = pytest.importorskip("rio_cogeo")
 
 

@@ -25,6 +25,8 @@ from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import noise, stopped_after
 from tests.model.raster import formats
 
+pytestmark = pytest.mark.usefixtures("unchecked")
+
 TILE_PX = 64
 JOB: dict[str, object] = {"image": "a"}
 

@@ -31,6 +31,8 @@ from tests.deploy.restoration.runs import (
 from tests.model.networks import plain
 from tests.quant.quick import one_guess, uniform
 
+pytestmark = pytest.mark.usefixtures("unchecked")
+
 NETWORK = "convbeers-xs-int8"
 OPTIONS: dict[str, Any] = {"network": NETWORK, "sensor": NAME, "interval": 90}
 

@@ -26,6 +26,8 @@ from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import restored
 from tests.shipped import shipped_pair
 
+pytestmark = pytest.mark.usefixtures("unchecked")
+
 Restored = Callable[[np.ndarray], np.ndarray]
 
 SENSOR = Sensor.load("pleiades-degraded")

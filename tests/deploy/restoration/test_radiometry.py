@@ -21,6 +21,8 @@ from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import marked, restored
 from tests.model.raster import formats as images
 
+pytestmark = pytest.mark.usefixtures("unchecked")
+
 SHAPE = 61, 47
 Run = Callable[..., tuple[np.ndarray, Row, list[str]]]
 

@@ -21,6 +21,8 @@ from beers_deploy.restoration.self_check import BlockMap
 from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import NAME, TRANSFORM, names, noise
 
+pytestmark = pytest.mark.usefixtures("unchecked")
+
 
 @pytest.fixture(scope="module")
 def other_network(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -15,6 +15,7 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.sensor_check.check import SensorCheck, check_source
 from tests.deploy.command_line import done, refused
 from tests.deploy.restoration.runs import simulated, source_of
+from tests.deploy.studies.evaluation.small_pairs import few_targets
 
 NAME = "pleiades-degraded"
 SENSOR = Sensor.load(NAME)
@@ -136,7 +137,10 @@ def test_commands_warn_and_strict_refuses(raw: np.ndarray, tmp_path: Path) -> No
         bd.restore(raw, network="convbeers-xs-int8", sensor=profile, strict=True)
 
 
-def test_pairs_are_compared_with_the_sensor_before_an_evaluation(tmp_path: Path) -> None:
+def test_pairs_are_compared_with_the_sensor_before_an_evaluation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few_targets(monkeypatch)
     profile = SENSOR.replace(snr_0=25, snr_1=55).save(tmp_path / "wrong.toml")
     pairs = simulated(sensor=SENSOR, size=320, seed=3).save(tmp_path / "pairs")
     (pairs / "recipe.json").unlink()

@@ -16,6 +16,8 @@ from tests.deploy.command_line import done, refused
 from tests.deploy.restoration.runs import names
 from tests.model.raster import formats as images
 
+pytestmark = pytest.mark.usefixtures("unchecked")
+
 pystac: Any = pytest.importorskip("pystac")
 validation: Any = pytest.importorskip("pystac.validation")
 mlm: Any = pytest.importorskip("pystac.extensions.mlm")

@@ -25,6 +25,8 @@ from tests.deploy.documents import valid
 from tests.deploy.restoration.runs import PLANES, marked, restored, stopped_after
 from tests.quant.tiling.small_networks import espcn, four_bands
 
+pytestmark = pytest.mark.usefixtures("unchecked")
+
 FLOAT = "convbeers-xs"
 INT8 = "convbeers-xs-int8"
 SENSOR = Sensor.load("pleiades-degraded")

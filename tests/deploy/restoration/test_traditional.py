@@ -17,7 +17,9 @@ from tests.deploy.command_line import done, refused
 from tests.deploy.restoration.runs import PLANES, marked, names, restored
 from tests.profiles.own_sensor import own_sensor
 
-SHAPE = (151, 67)
+pytestmark = pytest.mark.usefixtures("unchecked")
+
+SHAPE = (151, 37)
 SENSOR = Sensor.load("pleiades-degraded")
 
 

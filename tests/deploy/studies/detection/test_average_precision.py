@@ -199,7 +199,7 @@ def test_every_row_is_read_at_the_first_one_s_confidence() -> None:
     pairs = drawn(np.random.default_rng(7), 10)
     halved = [(truth, replace(found, scores=found.scores / 2)) for truth, found in pairs]
     rows = {"reference": hits_of(pairs), "halved": hits_of(halved)}
-    figures, confidence = score_rows(rows, NAMES, site_weights(list("abcdefghij"), 0))
+    figures, confidence = score_rows(rows, NAMES, np.ones((1, 10), np.int64))
     assert confidence == scored(pairs, NAMES)["own confidence"]
     assert figures["halved"]["recall"][0] == scored(halved, NAMES, confidence)["recall"]
     assert figures["halved"]["recall"][0] != figures["halved"]["own recall"][0]

@@ -1,6 +1,8 @@
 """Tests of a study whose detector finds bright objects: its boxes, its figures and its pictures."""
 
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.studies.detection import average_precision
 from beers_deploy.studies.detection.average_precision import find_hits, score_rows, site_weights
 from beers_deploy.studies.detection.boxes import Boxes, iou
 from beers_deploy.studies.detection.detector import Detector
@@ -86,6 +89,14 @@ def test_all_rows_are_shown_under_the_stretch_of_the_reference() -> None:
         assert_array_equal(acquisition.shown(method), stretch.to_srgb(dn))
 
 
+@pytest.fixture(autouse=True, scope="module")
+def few_draws() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(average_precision, "DRAWS", 200)
+        yield
+
+
+@cache
 def handmade(sites: int = 12, **counts: int) -> Comparison:
     """Return a comparison on sites of one ship each, of which each row finds `counts[row]`.
 
