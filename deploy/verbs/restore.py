@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -154,12 +155,14 @@ def restore(
     _refuse_without_effect(options, method, path, writes_none)
     if path is not None:
         require_image_file(path)
+    sensors = sensors_of(sensor)
     output = None
     # A dry run refuses the outputs that the run would refuse.
     if path is not None and not writes_none:
         output = _output(
             out,
             (stac, view),
+            len(sensors),
             overwrite,
             fix_detectors or "",
             compression=compression,
@@ -168,7 +171,6 @@ def restore(
             interval=interval,
             self_check=path_or_none(self_check),
         )
-    sensors = sensors_of(sensor)
     unknown = is_unknown(sensors)
     if interval is not None:
         require_sensors(sensors)
@@ -264,6 +266,7 @@ def _traditional(quality: str, unknown: bool) -> "Callable[[], Pipeline]":
 def _output(
     out: OutputFile | None,
     documents: tuple[OutputFile | None, OutputFile | None],
+    networks: int,
     overwrite: bool,
     fix_detectors: str,
     **how: Any,
@@ -273,6 +276,7 @@ def _output(
     Args:
         out: the TIFF.
         documents: the STAC item and the view.
+        networks: the largest number of networks that restore the bands.
         overwrite: True if these files may exist. They may too if a stopped run can be resumed.
         fix_detectors: the parameter of this name; "" if it is not given.
         how: the other fields of `Output`.
@@ -292,8 +296,9 @@ def _output(
     named = [path_or_none(document) for document in documents]
     if named[0] is not None:
         optional("pystac", "stac")
-        (item,) = network_paths(named[0], 1)
-        named += [item, item.with_suffix(".onnx")]
+        # Bands of one sensor share a network, whose item has no number if it is the only one.
+        items = sorted({*network_paths(named[0], 1), *network_paths(named[0], networks)})
+        named += chain(items, (item.with_suffix(".onnx") for item in items))
     # The list of faults is an output of its own where they are searched for.
     listed = found_list_path(path, fix_detectors)
     others = (*named, listed, output.self_check, output.interval_path)

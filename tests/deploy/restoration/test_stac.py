@@ -171,6 +171,11 @@ def test_each_sensor_has_a_network_and_the_traditional_pipeline_has_none(tmp_pat
     pixels = images.digital_numbers()
     image = images.write_tiff(tmp_path / "in.tif", pixels)
     sensors = "--network convbeers-xs --sensor B0=pleiades-degraded,B1=blind"
+    older = tmp_path / "a-network-2.json"
+    older.touch()
+    command = f"restore {image} {tmp_path}/out.tif {sensors} --cog --stac {tmp_path}/a.json"
+    assert f"{older} exists already" in refused(command)
+    older.unlink()
     content = restored_item(image, tmp_path / "a.json", sensors)
     names = ["a-network-1.json", "a-network-2.json"]
     assert content["assets"]["restored"]["processing:expression"]["expression"] == names
