@@ -218,14 +218,14 @@ def require_apart(
 def _paths_in(value: Any) -> list[Path]:
     """Return the paths of an argument; a shipped name is a path that does not exist.
 
-    Text may hold several with commas, and BAND=PATH. A folder of pairs has its images in two
-    folders.
+    Text may hold several with commas, BAND=PATH and PATH@SENSOR. A folder of pairs has its images
+    in two folders.
     """
     several = value if isinstance(value, list | tuple) else [value]
     names: list[str | os.PathLike[str]] = []
     for each in several:
         if isinstance(each, str):
-            names += [each, *re.split("[,=]", each)]
+            names += [each, *re.split("[,=]", each), *re.split("[,=@]", each)]
         elif isinstance(each, os.PathLike):
             names.append(each)
     paths = [Path(name) for name in names if name != ""]

@@ -73,6 +73,8 @@ def test_a_copy_of_a_network_restores_with_the_interval(
     onnx.save(model, mine)
     folder = write_pairs(tmp_path / "pairs", pairs_of())
     copy = tmp_path / "copy.onnx"
+    with pytest.raises(OptionError, match="is an input of this run"):
+        evaluate(methods=f"{mine}@blind", pairs=folder, calibrate=mine)
     evaluate(methods=str(mine), pairs=folder, calibrate=copy, progress=False)
     assert list(interval_of(bd.Network.load(copy)).quantiles) == [50, 68, 80, 90]
     image = folder / "degraded" / "a_0.tif"
