@@ -15,6 +15,7 @@ from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
 from beers_deploy.restoration.method import Restore
+from beers_deploy.studies.evaluation.methods import network_and_sensor
 from beers_deploy.studies.evaluation.pairs import NamedPair
 from beers_deploy.studies.evaluation.run import Evaluation
 
@@ -39,8 +40,7 @@ def network_to_calibrate(methods: Mapping[str, Any], out: Path) -> tuple[str, Pa
         OptionError: none or several methods are files of networks, or `out` has another suffix than
             the file.
     """
-    # NAME@SENSOR names a file with another sensor.
-    named = {name: Path(str(source).partition("@")[0]) for name, source in methods.items()}
+    named = {name: Path(network_and_sensor(str(source))[0]) for name, source in methods.items()}
     files = {name: path for name, path in named.items() if path.suffix in SUFFIXES}
     if len(files) != 1:
         raise OptionError(

@@ -111,6 +111,16 @@ METHOD_NAMES = (
 )
 
 
+def network_and_sensor(name: str) -> tuple[str, str]:
+    """Split NETWORK@SENSOR into its two parts, of which the second may be empty. The path of a file
+    may have an @ in it.
+    """
+    if Path(name).is_file():
+        return name, ""
+    network, _, sensor = name.partition("@")
+    return network, sensor
+
+
 def method_named(name: str, degraded: Sensor, reference: Sensor, around: Around = BOTH) -> Method:
     """Build the method that a user names in `methods`.
 
@@ -129,7 +139,7 @@ def method_named(name: str, degraded: Sensor, reference: Sensor, around: Around 
     """
     if name in WITHOUT_NETWORK:
         return method_without_network(name, degraded.nominal(), reference.nominal())
-    network, _, other = name.partition("@")
+    network, other = network_and_sensor(name)
     shipped = network.removesuffix(INT8) in shipped_names()
     if not shipped and Path(network).suffix not in (".onnx", ".safetensors"):
         raise OptionError(

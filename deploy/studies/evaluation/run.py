@@ -43,6 +43,7 @@ from beers_deploy.studies.evaluation.methods import (
     Method,
     method_named,
     method_of,
+    network_and_sensor,
 )
 from beers_deploy.studies.evaluation.pairs import (
     NamedPair,
@@ -226,8 +227,8 @@ def _inputs(
         if isinstance(source, Network):
             yield source.input
         elif isinstance(source, str | os.PathLike):
-            # A shipped name is no file, and NAME@SENSOR names a file with another sensor.
-            file = Path(os.fspath(source).partition("@")[0])
+            # A shipped name is no file.
+            file = Path(network_and_sensor(os.fspath(source))[0])
             if file.is_file():
                 yield file
     if lpips is not None and lpips.is_file():

@@ -1,6 +1,7 @@
 """Tests of the methods of an evaluation by name, and of the sensor that each is given."""
 
 import logging
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from beers_deploy.network_files import int8_for_sensor
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
+from beers_deploy.studies.evaluation.calibrate import network_to_calibrate
 from beers_deploy.studies.evaluation.methods import (
     BLIND,
     KNOWN,
@@ -80,6 +82,14 @@ def test_a_file_for_every_sensor_is_the_method_of_its_shipped_name() -> None:
     assert np.abs(others[0] - own).max() > 5
     np.testing.assert_allclose(method.with_sensor(SENSORS[0]).restore(dn), own, rtol=0, atol=1)
     assert method_named(f"{name}@blind", DEGRADED, REFERENCE).specialise is None
+
+
+def test_the_path_of_a_network_may_have_an_at_sign_in_it(tmp_path: Path) -> None:
+    path = tmp_path / "a@b" / "convbeers-xs-int8.onnx"
+    path.parent.mkdir()
+    shutil.copy(SHIPPED / path.name, path)
+    assert method_named(str(path), DEGRADED, REFERENCE).sensor_known == KNOWN
+    assert network_to_calibrate({"a": str(path)}, tmp_path / "out.onnx") == ("a", path)
 
 
 def test_full_scale_is_that_of_the_images_whatever_sensor_is_supposed() -> None:
