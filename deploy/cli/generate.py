@@ -98,11 +98,9 @@ def generated(command: Command, run: Callable[..., None]) -> Callable[..., None]
         _for_typer(parameter, text_for_command(texts[parameter.name], command.verb))
         for parameter in command.parameters
     ]
-    extra: dict[str, Any] = {"json": Json} if command.has_table else {}
-    extra |= {"quiet": Quiet, "verbose": Verbose}
-    for name, hint in extra.items():
-        default = None if name == "json" else False
-        parameters.append(_keyword(name, hint, default))
+    if command.has_table:
+        parameters.append(_keyword("json", Json, None))
+    parameters += [_keyword("quiet", Quiet, False), _keyword("verbose", Verbose, False)]
     called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     called.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     called.__doc__ = in_options(command.help, command.verb)
