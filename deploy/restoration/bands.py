@@ -40,6 +40,12 @@ def sensors_of(sensor: SensorLike | Mapping[str, SensorLike]) -> dict[str, Senso
     if isinstance(sensor, Mapping):
         if not sensor:
             raise OptionError("`sensor` names no band. Name each band with its sensor.")
+        for band in sensor:
+            if not isinstance(band, str):
+                raise OptionError(
+                    f"`sensor` must have texts as names of bands, got {printable(repr(band))}. "
+                    "Write them as the image names them, or 'B1', 'B2'."
+                )
         return {band: Sensor.load(profile) for band, profile in sensor.items()}
     # The path of one profile may have an equals sign in it.
     if not isinstance(sensor, str) or "=" not in sensor or Path(sensor).is_file():

@@ -68,3 +68,5 @@ def test_one_profile_is_for_all_bands(tmp_path: Path) -> None:
     assert sensors_of(FIRST) == {"": Sensor.load(FIRST)}
     with pytest.raises(OptionError):
         sensors_of("=a,B1=b")
+    with pytest.raises(OptionError, match="texts as names of bands, got 1"):
+        sensors_of({1: FIRST, 2: SECOND})  # type: ignore[dict-item]
