@@ -182,14 +182,14 @@ def evaluate(
 
 def named_methods(methods: Methods) -> dict[str, Any]:
     """Return the methods by the names of their rows, the degraded input first."""
-    if isinstance(methods, Mapping):
-        return {"degraded": "degraded", **methods}
-    names = listed(methods)
+    names = methods if isinstance(methods, Mapping) else listed(methods)
     if not all(isinstance(name, str) for name in names):
         raise OptionError(
             f"`methods` must be names, or a mapping of names to networks or functions, got "
             f"{printable(repr(methods))}."
         )
+    if isinstance(methods, Mapping):
+        return {"degraded": "degraded", **methods}
     # A method that is named twice is measured once, in the order that is given.
     return {name.strip(): name.strip() for name in ("degraded", *names)}
 

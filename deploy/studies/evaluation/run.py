@@ -252,10 +252,11 @@ def _method(
 
         def restore(image: np.ndarray) -> np.ndarray:
             restored = np.asarray(source(image))
-            if restored.shape != image.shape:
+            if restored.shape != image.shape or restored.dtype.kind not in "uif":
                 raise ImageError(
                     f"The function {name} must return an image of {times(image.shape)}, got "
-                    f"{times(restored.shape) or 'no array'}. Return one value for each pixel."
+                    f"{times(restored.shape) or 'no array'} of {restored.dtype}. Return one real "
+                    "number for each pixel."
                 )
             return restored
 

@@ -61,10 +61,20 @@ def test_the_command_on_a_folder_of_pairs(tmp_path: Path) -> None:
 
 def test_a_function_that_returns_another_shape_is_refused() -> None:
     image: Any = simulate(size=64, progress=False)
-    functions: dict[str, Any] = {"no array": lambda _: None, "5 x 64": lambda dn: dn[:5]}
+    functions: dict[str, Any] = {
+        "no array": lambda _: None,
+        "5 x 64": lambda dn: dn[:5],
+        "64 x 64 of complex": lambda dn: dn + 1j,
+    }
     for words, function in functions.items():
         with pytest.raises(ImageError, match=f"function mine must return .* 64 x 64, got {words}"):
             evaluate(methods={"mine": function}, pairs=[image])
+
+
+def test_a_name_that_is_no_text_is_refused() -> None:
+    methods: Any = {1: np.asarray}
+    with pytest.raises(OptionError, match="`methods` must be names, or a mapping of names"):
+        evaluate(methods=methods)
 
 
 def test_no_pair_at_all_is_refused() -> None:
