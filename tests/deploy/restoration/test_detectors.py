@@ -205,6 +205,23 @@ def test_sentences_name_kind_place_and_remedy() -> None:
     assert not sentences(faults_in_strips(source_of(ground(HEIGHT, WIDTH)), 4095))
 
 
+@pytest.mark.parametrize(
+    ("gains", "words"),
+    [
+        (
+            np.random.default_rng(1).normal(1, 0.01, 400),
+            "the gains or offsets of columns differ by",
+        ),
+        (np.where(np.arange(WIDTH) == 40, 1.05, 1), "1 column is off in gain or offset (column 40"),
+        (np.where(np.arange(WIDTH) % 2, 1.5, 1), "as of a mosaic of colour filters"),
+    ],
+)
+def test_a_sentence_names_what_is_wrong_with_the_gains(gains: np.ndarray, words: str) -> None:
+    pixels = np.rint(ground(HEIGHT, len(gains)) * gains).astype(np.uint16)
+    lines = sentences(faults_in_strips(source_of(pixels), 4095))
+    assert any(words in sentence for sentence in lines), lines
+
+
 def test_few_rows_of_a_large_image_are_read() -> None:
     class Counting(ArraySource):
         rows = 0

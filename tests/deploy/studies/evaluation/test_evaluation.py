@@ -82,9 +82,9 @@ def test_no_pair_at_all_is_refused() -> None:
         evaluate(methods=["degraded"], pairs=[])
 
 
-@pytest.mark.parametrize("number", [0.0, 12.5, float("nan")])
+@pytest.mark.parametrize("number", [0.0, 12.5, float("nan"), "x"])
 @pytest.mark.parametrize(("option", "most"), [("brightness", 1), ("bits_per_pixel", 12)])
-def test_a_number_out_of_range_is_refused(number: float, option: str, most: int) -> None:
+def test_a_number_out_of_range_is_refused(number: Any, option: str, most: int) -> None:
     with pytest.raises(OptionError, match=f"`{option}` .* above 0 and at most {most},"):
         evaluate(methods=["wiener"], **{option: (1, number)})
 
