@@ -162,10 +162,13 @@ class Sample:
         return error
 
 
+@torch.inference_mode(False)
 def finetune(
     core: IntCore, full: Graph, tuning: Tuning, shifts: Shifts = SHIFTS
 ) -> tuple[IntCore, int]:
     """Train the integers of a core, and change its scales where that reduces the error.
+
+    Gradients are computed even if the caller has switched them off, as with `torch.no_grad()`.
 
     Args:
         core: the integer core to start from.

@@ -138,6 +138,20 @@ def test_a_worse_result_is_discarded(
 
 
 @pytest.mark.usefixtures("no_moves")
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_it_trains_where_the_caller_has_switched_gradients_off(
+    quantized: Quantized,
+    float_onnx: onnx.ModelProto,
+    patches: Patches,
+    mode: type[torch.no_grad | torch.inference_mode],
+) -> None:
+    graph = read_planes(correction_graph(float_onnx))
+    with mode():
+        _, steps = finetune(quantized.core, graph, Tuning([patches.pairs[0]], 1))
+    assert steps == 1
+
+
+@pytest.mark.usefixtures("no_moves")
 @pytest.mark.parametrize(("rate", "steps"), [(0.0, 44), (0.1, 46)])
 def test_it_goes_on_by_itself_while_held_out_pairs_gain(
     quantized: Quantized,
