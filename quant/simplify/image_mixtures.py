@@ -112,7 +112,9 @@ def _mixed(weight: np.ndarray, groups: int, mixture: np.ndarray) -> np.ndarray:
         groups: its groups.
         mixture: (M, C) the matrix of the mixture.
     """
-    by_group = weight.astype(np.float64).reshape(groups, -1, *weight.shape[1:])
-    by_group = np.moveaxis(by_group, 2, -1)
-    mixed = np.moveaxis(by_group @ mixture.reshape(groups, 1, 1, -1, mixture.shape[1]), -1, 2)
-    return np.asarray(mixed.reshape(-1, *mixed.shape[2:]))
+    rows = np.moveaxis(weight.astype(np.float64), 1, -1)
+    # One product of matrices for each group: one for each position of each kernel takes many times
+    # as long.
+    by_group = rows.reshape(groups, -1, rows.shape[-1])
+    mixed = by_group @ mixture.reshape(groups, -1, mixture.shape[1])
+    return np.moveaxis(mixed.reshape(*rows.shape[:-1], -1), -1, 1)
