@@ -21,7 +21,6 @@ checked as those integer operators.
 
 from copy import deepcopy
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from onnx import ModelProto, TensorProto
@@ -39,29 +38,9 @@ ZERO = 2
 """The input with the zero point of the activations, of every operator in OPERATORS."""
 
 
-class Places(NamedTuple):
-    """The numbers of an integer operator's inputs that hold weights and zero points.
-
-    Attributes:
-        weight: the input with the weights.
-        weight_zero: the input with the zero point of the weights.
-        result_zero: the input with the zero point of the result; None for a result in int32.
-    """
-
-    weight: int
-    weight_zero: int
-    result_zero: int | None
-
-
-OPERATORS = {
-    "QLinearConv": Places(3, 5, 7),
-    "QLinearMatMul": Places(3, 5, 7),
-    "ConvInteger": Places(1, 3, None),
-    "MatMulInteger": Places(1, 3, None),
-}
-"""ONNX's operators whose kernels multiply 8-bit numbers.
-
-Activations are the first input; a None result is int32.
+OPERATORS = {"QLinearConv": 3, "QLinearMatMul": 3, "ConvInteger": 1, "MatMulInteger": 1}
+"""ONNX's operators whose kernels multiply 8-bit numbers, and the input with the weights. Two behind
+it is their zero point. Activations are the first input.
 """
 
 FLOAT_OPERATORS = {"Conv": "QLinearConv", "MatMul": "QLinearMatMul", "Gemm": "QLinearMatMul"}
@@ -72,7 +51,7 @@ onnxruntime makes of each.
 REQUANTISING = {"QLinearConv", "QLinearAdd"}
 """Operators whose result may be stored 128 lower if a ReLU follows."""
 RESULT_ZERO = 7
-"""The input of these that holds the zero point of the result."""
+"""The input of operators with an 8-bit result that holds its zero point."""
 
 
 def with_exact_sums(model: ModelProto) -> ModelProto:
@@ -154,7 +133,7 @@ def _move_relu_down(largest: dict[str, int], graph: OnnxGraph, node: Node) -> li
         return None
     result = node.result
     writer = graph.sole_writer(node.source)
-    if writer is None or writer.op_type not in REQUANTISING or result in graph.outputs:
+    if writer.op_type not in REQUANTISING or result in graph.outputs:
         return None
     readers = graph.readers[result]
     all_hold = _holds(graph, writer, RESULT_ZERO, middle) and all(
@@ -192,10 +171,10 @@ def _add_exactly(largest: dict[str, int], graph: OnnxGraph, node: Node) -> list[
     """
     if node.op_type in FLOAT_OPERATORS:
         return _add_dequantised(graph, node)
-    places = OPERATORS.get(node.op_type)
-    if places is None:
+    place = OPERATORS.get(node.op_type)
+    if place is None:
         return None
-    weight = graph.value(node, places.weight)
+    weight = graph.value(node, place)
     if weight is None:
         raise ModelError(
             f"{node.op_type} {printable(repr(node.name))} in the INT8 network has computed "
@@ -205,7 +184,7 @@ def _add_exactly(largest: dict[str, int], graph: OnnxGraph, node: Node) -> list[
     activations_end = largest.get(node.source, UINT8_MAX)
     if weight.dtype != np.int8 or cannot_saturate(node.op_type, weight, activations_end):
         return None
-    _lift(graph, node, places.weight, places.weight_zero)
+    _lift(graph, node, place, place + 2)
     zero = graph.value(node, ZERO)
     if zero is None or zero.dtype != np.int8:
         return None
@@ -217,8 +196,9 @@ def _add_exactly(largest: dict[str, int], graph: OnnxGraph, node: Node) -> list[
     if source not in graph.writers:
         nodes = [*_moved(graph, node.source, MIDDLE, TensorProto.UINT8, source), node]
     _set_input(node, 0, source)
-    if places.result_zero is not None:
-        _lift(graph, node, places.result_zero)
+    # The other operators have a result in int32.
+    if node.op_type.startswith("QLinear"):
+        _lift(graph, node, RESULT_ZERO)
         result = node.result
         node.outputs = (f"{result}.unsigned",)
         nodes += _moved(graph, node.result, -MIDDLE, TensorProto.INT8, result)
@@ -229,20 +209,16 @@ def _add_dequantised(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Return a float operator on dequantised weights, after the node that dequantises uint8
     ones.
     """
-    source = graph.writers.get(node.inputs[1])
-    if source is None or source.op_type != "DequantizeLinear":
-        return None
+    source = graph.writer(node.inputs[1])
     weight = graph.value(source, 0)
-    if weight is None or weight.dtype != np.int8:
+    if source.op_type != "DequantizeLinear" or weight is None or weight.dtype != np.int8:
         return None
     weight = weight.T if node.attributes.get("transB") else weight
     if cannot_saturate(FLOAT_OPERATORS[node.op_type], weight, UINT8_MAX):
         return None
     # A copy, because another node may read the same weights as int8.
     name = f"{node.result}.weight_from_uint8"
-    lifted = Node.of(source.written())
-    lifted.proto.name = name
-    lifted.outputs = (name,)
+    lifted = Node.new(source.op_type, source.inputs, name, **source.attributes)
     _lift(graph, lifted, 0, 2)
     _set_input(node, 1, name)
     return [lifted, node]

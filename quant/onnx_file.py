@@ -38,6 +38,7 @@ from beers_deploy.profiles.toml import read_whole, unreadable
 from beers_deploy.quant.domains import IR_VERSION, MICROSOFT, OPSET, STANDARD, opset_of
 from beers_deploy.quant.onnx.external_weights import take_in
 from beers_deploy.quant.onnx.graph import OnnxGraph
+from beers_deploy.quant.onnx.messages import replace_all
 from beers_deploy.quant.onnx.node_order import sort_nodes
 from beers_deploy.quant.onnx.runnable import check_runnable, named
 from beers_deploy.quant.simplify.simplify import simplify
@@ -305,14 +306,11 @@ def with_one_output(model: ModelProto, name: str, where: str) -> ModelProto:
         )
     copy = deepcopy(model)
     graph = copy.graph
-    del graph.output[:]
-    graph.output.append(values[name])
+    replace_all(graph.output, [values[name]])
     OnnxGraph(copy).save()
     reads = {name, *chain.from_iterable(node.input for node in graph.node)}
     for parts in (graph.input, graph.initializer):
-        needed = [part for part in parts if part.name in reads]
-        del parts[:]
-        parts.extend(needed)
+        replace_all(parts, [part for part in parts if part.name in reads])
     helper.set_model_props(copy, {**metadata(copy), OUTPUT: name})
     return _simplified(copy, where, to_run=False)
 

@@ -42,6 +42,7 @@ from beers_deploy.quant.graph import (
 from beers_deploy.quant.host_part import HostPart
 from beers_deploy.quant.input_range import ranges_of_result, to_shares
 from beers_deploy.quant.metrics import SCALE
+from beers_deploy.quant.onnx.messages import replace_all
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.samples.patches import Pair, Patches
 from beers_deploy.quant.session import open_any_size, open_session, planes_of, result_of
@@ -352,6 +353,5 @@ def rounded_model(model: ModelProto, grids: Mapping[str, Grid]) -> ModelProto:
             inputs = [f"{name}.{suffix}" for suffix in suffixes]
             nodes.append(helper.make_node(kind, inputs, [f"{name}.{kind}"]))
         nodes.append(helper.make_node("Mul", [f"{name}.Clip", f"{name}.scale"], [name]))
-    del model.graph.node[:]
-    model.graph.node.extend(nodes)
+    replace_all(model.graph.node, nodes)
     return model

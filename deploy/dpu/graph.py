@@ -13,7 +13,8 @@ from onnx import TensorProto, helper, numpy_helper, shape_inference
 from beers_deploy.profiles.errors import CODE_FAULTS, ModelError, printable
 from beers_deploy.quant.domains import OPSET
 from beers_deploy.quant.graph.quantized import Scale
-from beers_deploy.quant.onnx.graph import Node, sizes_of
+from beers_deploy.quant.onnx.graph import Node
+from beers_deploy.quant.onnx.messages import sizes_of
 from beers_deploy.quant.onnx.runnable import LIST_VALUES
 from beers_deploy.quant.onnx.window import Pair, Window
 

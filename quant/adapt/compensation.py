@@ -21,6 +21,7 @@ from onnx import TensorProto
 
 from beers_deploy.model.progress import step
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.messages import replace_all
 from beers_deploy.quant.onnx.window import Pair, Window
 from beers_deploy.quant.session import open_any_size, tensors_of, with_outputs
 from beers_deploy.quant.simplify.fold_affine import is_convolution
@@ -88,7 +89,7 @@ class Networks:
         """
         numbers = {"weight": weight, "bias": bias}
         names = [self.graph.add_constant(f"{node.name}.{role}", v) for role, v in numbers.items()]
-        node.inputs = (node.inputs[0], *names)
+        node.inputs = (node.source, *names)
         self.graph.save()
 
 
@@ -124,14 +125,14 @@ def compensated(
         if behind.intersection(node.inputs):
             behind.update(node.outputs)
             # Convolutions within an exact replacement have no tensor to be compared with.
-            is_known = networks.is_conv(node) and node.outputs[0] in originals
+            is_known = networks.is_conv(node) and node.result in originals
             weight = networks.graph.value(node, 1)
             if is_known and weight is not None and np.prod(weight.shape[1:]) <= MOST_UNKNOWNS:
                 convolutions.append(node)
     targets = _targets(networks, convolutions)
     for number, (node, target) in enumerate(zip(convolutions, targets, strict=True), 1):
         step(f"fitting convolution {number} of {len(convolutions)}")
-        _fit(networks, node, target, factors.get(node.outputs[0]))
+        _fit(networks, node, target, factors.get(node.result))
     return model
 
 
@@ -158,7 +159,7 @@ def _targets(networks: Networks, nodes: Sequence[Node]) -> list[list[Target]]:
         return targets
     generator = np.random.default_rng(0)
     unknowns = [int(np.prod(networks.weights(node)[0].shape[1:])) for node in nodes]
-    outputs = [node.outputs[0] for node in nodes]
+    outputs = [node.result for node in nodes]
     for maps in values_of(networks.original, outputs, networks.images):
         for target, values, count in zip(targets, maps, unknowns, strict=True):
             total = max(LEAST_PIXELS, PIXELS_OF_EACH_UNKNOWN * count)
@@ -173,7 +174,7 @@ def _targets(networks: Networks, nodes: Sequence[Node]) -> list[list[Target]]:
 def _scale_activations(networks: Networks, replaced: Sequence[Node]) -> dict[str, np.ndarray]:
     """Put k in front of activations and 1 / k behind them; return k (C,) of each tensor."""
     nodes = [node for node in replaced if _may_scale(networks, node)]
-    names = list(chain.from_iterable((node.inputs[0], node.outputs[0]) for node in nodes))
+    names = list(chain.from_iterable((node.source, node.result) for node in nodes))
     if not names:
         return {}
     values = list[list[np.ndarray]]()
@@ -184,16 +185,16 @@ def _scale_activations(networks: Networks, replaced: Sequence[Node]) -> dict[str
     factors = dict[str, np.ndarray]()
     for node, source, result in zip(nodes, columns[::2], columns[1::2], strict=True):
         best = _best_factors(node.op_type == "HardSwish", source, result)
-        factors[node.inputs[0]] = best
-        before = networks.graph.writers[node.inputs[0]]
+        factors[node.source] = best
+        before = networks.graph.writer(node.source)
         weight, bias = networks.weights(before)
         networks.set_weights(before, weight * best[:, None, None, None], bias * best)
         if node.op_type != "HardSwish":
             continue
-        for reader in networks.graph.readers[node.outputs[0]]:
+        for reader in networks.graph.readers[node.result]:
             weight, bias = networks.weights(reader)
             # Depthwise convolutions and those of groups read only their own group's channels.
-            shape = (reader.attributes.get("group", 1), 1, -1, 1, 1)
+            shape = (reader.groups, 1, -1, 1, 1)
             split = weight.reshape(shape[0], -1, *weight.shape[1:])
             networks.set_weights(reader, (split / best.reshape(shape)).reshape(weight.shape), bias)
     return factors
@@ -202,13 +203,11 @@ def _scale_activations(networks: Networks, replaced: Sequence[Node]) -> dict[str
 def _may_scale(networks: Networks, node: Node) -> bool:
     """Return True if factors can go into the convolutions in front of an activation and behind."""
     graph = networks.graph
-    before = graph.sole_writer(node.inputs[0])
-    if before is None or not networks.is_conv(before):
+    if not networks.is_conv(graph.sole_writer(node.source)):
         return False
-    (output,) = node.outputs
-    behind = all(networks.is_conv(reader) for reader in graph.readers[output])
+    behind = all(networks.is_conv(reader) for reader in graph.readers[node.result])
     # A HardSigmoid is only scaled in front.
-    is_alone = node.op_type == "HardSwish" and behind and output not in graph.outputs
+    is_alone = node.op_type == "HardSwish" and behind and node.result not in graph.outputs
     return is_alone or node.op_type == "HardSigmoid"
 
 
@@ -248,10 +247,10 @@ def _fit(
     if kernel_and_window is None:
         return
     kernel, window = kernel_and_window
-    groups = int(node.attributes.get("group", 1))
+    groups = node.groups
     unknowns = int(np.prod(weight.shape[1:]))
     equations = Equations(groups, unknowns, len(weight) // groups)
-    names = [node.inputs[0], node.outputs[0]]
+    names = [node.source, node.result]
     adapted = values_of(networks.adapted, names, networks.images)
     for target, (source, result) in zip(targets, adapted, strict=True):
         expected = target.values if factors is None else target.values * factors
@@ -349,9 +348,7 @@ def values_of(
 ) -> Iterator[list[np.ndarray]]:
     """Yield the named tensors for each image; only the nodes in front of them are run."""
     part = with_outputs(model, dict.fromkeys(names, TensorProto.FLOAT))
-    outputs = [value for value in part.graph.output if value.name in names]
-    del part.graph.output[:]
-    part.graph.output.extend(outputs)
+    replace_all(part.graph.output, [v for v in part.graph.output if v.name in names])
     OnnxGraph(part).save()
     session = open_any_size(part)
     for image in images:

@@ -16,8 +16,12 @@ from beers_deploy.quant.graph.operations import LEAKY_SLOPE
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.resize import Resizing, alone_enlarges_image
 from beers_deploy.quant.simplify.fold_affine import per_channel
-from beers_deploy.quant.simplify.spelled_activations import gelu_gate_input, other_operand
-from beers_deploy.quant.simplify.standard_operators import float_shapes
+from beers_deploy.quant.simplify.spelled_activations import (
+    gelu_gate_input,
+    has_slope_of_dpu,
+    other_operand,
+    slope_and_offset,
+)
 
 
 class Kind(StrEnum):
@@ -71,7 +75,6 @@ def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
     Returns:
         The kind; None if the node is not replaced, such as a Sigmoid that is a part of a SiLU.
     """
-    attributes = node.attributes
     resizing = Resizing.of(graph, node) if node.op_type == "Resize" else None
     kinds = {
         Kind.attention: shrinking(graph, node),
@@ -92,9 +95,8 @@ def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
         part_of_silu = readers and all(silu_input(graph, reader) for reader in readers)
         return None if part_of_silu else Kind[node.op_type.lower()]
     if node.op_type == "HardSigmoid":
-        slope = attributes.get("alpha", 0.2)
-        is_plain = np.allclose((slope, attributes.get("beta", 0.5)), (1 / 6, 0.5), 1e-4)
-        return None if is_plain or not slope else Kind.hard_sigmoid
+        slope, _ = slope_and_offset(node)
+        return None if has_slope_of_dpu(node) or not slope else Kind.hard_sigmoid
     slopes = slopes_of(graph, node)
     if slopes is None:
         return None
@@ -119,42 +121,29 @@ def silu_input(graph: OnnxGraph, node: Node) -> str:
     if node.op_type in ("Gelu", "Mish"):
         return node.source
     if node.op_type == "Mul":
-        for source, gate in (node.inputs, node.inputs[::-1]):
+        for source, gate in node.orders:
             gelu = gelu_gate_input(graph, gate)
-            if gelu and other_operand(graph, graph.writers.get(source), "Mul", 0.5) == gelu:
+            if gelu and other_operand(graph, source, "Mul", 0.5) == gelu:
                 return gelu
-            before = graph.writers.get(gate)
-            if before is not None and _is_gate(graph, before, source):
+            if _is_gate(graph, graph.writer(gate), source):
                 return source
     return ""
 
 
 def _is_gate(graph: OnnxGraph, node: Node, source: str) -> bool:
     """Return True if a node is Sigmoid(c x) or Tanh(Softplus(x)) of a tensor x."""
-    before = graph.writers.get(node.source)
+    before = graph.writer(node.source)
     if node.op_type == "Tanh":
-        return before is not None and before.op_type == "Softplus" and source in before.inputs
-    is_source = node.source == source or (
-        before is not None and _by_constant(graph, before, source)
-    )
-    return node.op_type == "Sigmoid" and is_source
-
-
-def _by_constant(graph: OnnxGraph, node: Node, source: str) -> bool:
-    """Return True if a node multiplies a tensor by a constant number.
-
-    Args:
-        graph: the graph that the node belongs to.
-        node: any node.
-        source: name of the tensor.
-    """
-    if node.op_type != "Mul" or source not in node.inputs:
+        return before.op_type == "Softplus" and before.source == source
+    if node.op_type != "Sigmoid" or node.source == source:
+        return node.op_type == "Sigmoid"
+    if before.op_type != "Mul" or source not in before.inputs:
         return False
-    factor = node.inputs[1 - node.inputs.index(source)]
-    before = graph.writers.get(factor)
+    factor = before.inputs[1 - before.inputs.index(source)]
+    cast = graph.writer(factor)
     # The runtime leaves a Cast of the constant of a Swish.
-    name = before.inputs[0] if before is not None and before.op_type == "Cast" else factor
-    return name in graph.constants and graph.constants[name].size == 1
+    value = graph.constants.get(cast.source if cast.op_type == "Cast" else factor)
+    return value is not None and value.size == 1
 
 
 def slopes_of(graph: OnnxGraph, node: Node) -> np.ndarray | None:
@@ -180,7 +169,7 @@ def nodes_by_kind(graph: OnnxGraph) -> dict[Kind, list[Node]]:
     The sizes of the graph's tensors are inferred and stored in it, too.
     """
     nodes: dict[Kind, list[Node]] = {}
-    graph.shapes = float_shapes(graph)
+    graph.infer_shapes()
     on_host = host_end(graph).replaced
     for node in graph.nodes:
         kind = kind_of(graph, node)

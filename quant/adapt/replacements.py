@@ -56,7 +56,7 @@ from beers_deploy.quant.simplify.fold_affine import (
     fold_in_front,
     is_convolution,
 )
-from beers_deploy.quant.simplify.standard_operators import float_shapes
+from beers_deploy.quant.simplify.spelled_activations import SLOPE_AND_OFFSET, slope_and_offset
 
 TANH_SLOPE = 0.8
 """The slope, of 0.6 to 1, with the least error for inputs whose standard deviation is 1 to 2."""
@@ -99,7 +99,7 @@ def replaced(
     graph.rewrite(lambda _, node: plan.get(node))
     graph.rewrite(fold_behind)
     graph.save()
-    graph.shapes = float_shapes(graph)
+    graph.infer_shapes()
     fold_in_front(graph)
     graph.save()
     network = activations_first(network)
@@ -122,7 +122,7 @@ def _approximation(
     if kind is Kind.silu:
         return [node.replaced_by("HardSwish", [silu_input(graph, node)])]
     if kind is Kind.sigmoid:
-        return [node.replaced_by("HardSigmoid", node.inputs, alpha=1 / 6, beta=0.5)]
+        return [node.replaced_by("HardSigmoid", node.inputs, **SLOPE_AND_OFFSET)]
     if kind is Kind.tanh:
         return _clipped_line(graph, node)
     if kind is Kind.bilinear:
@@ -139,21 +139,16 @@ def _approximation(
 
 def _clipped_line(graph: OnnxGraph, node: Node) -> list[Node]:
     """Return clip(slope x, -1, 1) in place of tanh(x), as ReLU6(3 slope x + 3) / 3 - 1."""
-    (output,) = node.outputs
+    output = node.result
     three, zero, six, minus_one = (
-        graph.add_constant(f"{output}.{number}", np.array(float(number)))
-        for number in (3, 0, 6, -1)
+        graph.add_constant(f"{output}.{number}", number) for number in (3, 0, 6, -1)
     )
-    names = [f"{output}.{step}" for step in ("shifted", "clipped", "shrunk")]
-    shifted, clipped, shrunk = names
-    scaled = _times(graph, node.inputs[0], np.array([3 * TANH_SLOPE]), f"{output}.scaled")
-    return [
-        scaled,
-        Node.new("Add", [scaled.outputs[0], three], shifted),
-        Node.new("Clip", [shifted, zero, six], clipped, node.name),
-        _times(graph, clipped, np.array([1 / 3]), shrunk),
-        Node.new("Add", [shrunk, minus_one], output, f"{output}.lowered"),
-    ]
+    scaled = _times(graph, node.source, np.array([3 * TANH_SLOPE]), f"{output}.scaled")
+    shifted = Node.new("Add", [scaled.result, three], f"{output}.shifted")
+    clipped = Node.new("Clip", [shifted.result, zero, six], f"{output}.clipped", node.name)
+    shrunk = _times(graph, clipped.result, np.array([1 / 3]), f"{output}.shrunk")
+    lowered = Node.new("Add", [shrunk.result, minus_one], output, f"{output}.lowered")
+    return [scaled, shifted, clipped, shrunk, lowered]
 
 
 def _cubic_convolution(graph: OnnxGraph, node: Node) -> list[Node]:
@@ -167,42 +162,33 @@ def _cubic_convolution(graph: OnnxGraph, node: Node) -> list[Node]:
     on_host = host_end(graph).replaced
     for reader in graph.readers[result]:
         if reader.result not in on_host:
-            reader.inputs = tuple(convolved if name == result else name for name in reader.inputs)
+            reader.read_instead(result, convolved)
     factor = int(Resizing.of(graph, node).factors[2])
     base = Base(factor=factor, mode="cubic")
     weight = base.kernel(graph.channels(image))
     mirrored = f"{result}.mirrored"
-    border = np.array([0, 0, REACH_PX, REACH_PX] * 2)
-    names = [
-        graph.add_constant(f"{result}.border", border, np.int64),
-        graph.add_constant(f"{result}.weight", weight),
-    ]
+    weight_name = graph.add_constant(f"{result}.weight", weight)
     convolution = Node.new(
         "ConvTranspose",
-        [mirrored, names[1]],
+        [mirrored, weight_name],
         convolved,
         kernel_shape=list(weight.shape[2:]),
         strides=[factor] * 2,
         # The pads crop the results of the mirrored border.
         pads=[base.kernel_pad + REACH_PX * factor] * 4,
     )
-    return [
-        Node.new("Pad", [image, names[0]], mirrored, mode="reflect"),
-        convolution,
-        node,
-    ]
+    return [graph.mirrored(image, REACH_PX, mirrored), convolution, node]
 
 
 def _scaled_hard_sigmoid(graph: OnnxGraph, node: Node) -> list[Node]:
     """Return clip(slope x + offset, 0, 1) as HardSigmoid of 6 slope x + 6 (offset - 0.5)."""
-    slope = node.attributes.get("alpha", 0.2)
-    offset = node.attributes.get("beta", 0.5)
-    (output,) = node.outputs
-    scaled = _times(graph, node.inputs[0], np.array([6 * slope]), f"{output}.scaled")
+    slope, offset = slope_and_offset(node)
+    output = node.result
+    scaled = _times(graph, node.source, np.array([6 * slope]), f"{output}.scaled")
     # With z = 6 (slope x + offset - 0.5), clip(z / 6 + 0.5, 0, 1) is the original function.
-    shift = graph.add_constant(f"{output}.offset", np.array(6 * (offset - 0.5)))
-    shifted = Node.new("Add", [scaled.outputs[0], shift], f"{output}.shifted")
-    hard = Node.new("HardSigmoid", shifted.outputs, output, node.name, alpha=1 / 6, beta=0.5)
+    shift = graph.add_constant(f"{output}.offset", 6 * (offset - 0.5))
+    shifted = Node.new("Add", [scaled.result, shift], f"{output}.shifted")
+    hard = node.replaced_by("HardSigmoid", shifted.outputs, **SLOPE_AND_OFFSET)
     return [scaled, shifted, hard]
 
 
@@ -217,29 +203,29 @@ def _two_branches(graph: OnnxGraph, node: Node) -> list[Node]:
     assert slopes is not None  # noqa: S101 - `kind_of` has asked
     # ReLU adds nothing negative, so a slope s above 1 is computed as -(-s x + ReLU((s - 1) x)).
     signs = np.where(slopes > 1, -1, 1)
-    source = node.inputs[0]
-    (output,) = node.outputs
+    source = node.source
+    output = node.result
     nodes = []
     bent_source = source
     before = graph.sole_writer(source)
     # A convolution that only this node reads is computed twice, each time with the factors in its
     # weights, so that each branch is rounded once. For other tensors, each branch gets a depthwise
     # convolution.
-    if before is not None and is_convolution(graph, before):
+    if is_convolution(graph, before):
         bent_source = f"{output}.source"
-        twin = Node.of(before.written())
-        twin.name = twin.proto.name = f"{before.name}.bent"
-        twin.outputs = (bent_source,)
-        nodes.append(twin)
+        name = f"{before.name}.bent"
+        nodes.append(
+            Node.new(before.op_type, before.inputs, bent_source, name, **before.attributes)
+        )
     straight = _times(graph, source, signs * slopes, f"{output}.straight")
     scaled = _times(graph, bent_source, np.abs(1 - slopes), f"{output}.scaled")
     bent = Node.new("Relu", scaled.outputs, f"{output}.bent")
-    names = [straight.outputs[0], bent.outputs[0]]
+    names = [straight.result, bent.result]
     nodes += [straight, scaled, bent]
     if (signs > 0).all():
         return [*nodes, Node.new("Add", names, output, node.name)]
     negated = Node.new("Add", names, f"{output}.negated")
-    return [*nodes, negated, _times(graph, negated.outputs[0], signs, output)]
+    return [*nodes, negated, _times(graph, negated.result, signs, output)]
 
 
 def _times(graph: OnnxGraph, source: str, factors: np.ndarray, output: str) -> Node:

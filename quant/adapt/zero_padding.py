@@ -26,7 +26,7 @@ def pads_of(graph: OnnxGraph, node: Node) -> tuple[int, ...]:
     """
     if node.op_type != "Pad" or node.attributes.get("mode") not in ("edge", "reflect"):
         return ()
-    readers = {reader.op_type for reader in graph.readers[node.outputs[0]]}
+    readers = {reader.op_type for reader in graph.readers[node.result]}
     amounts = graph.numbers(node, 1, "pads") or []
     is_of_pixels = len(amounts) == 8 and not any((*amounts[:2], *amounts[4:6]))
     if readers != {"Conv"} or not is_of_pixels or min(amounts) < 0:
@@ -63,28 +63,23 @@ def pad_by_zeros(model: onnx.ModelProto) -> None:
     mirrored = f"{image}.mirrored"
     whole = f"{result}.whole"
     for node in graph.nodes:
-        node.inputs = tuple(mirrored if name == image else name for name in node.inputs)
+        node.read_instead(image, mirrored)
     graph.rename(result, whole)
-
-    def constant(name: str, numbers: list[int]) -> str:
-        return graph.add_constant(name, np.array(numbers), np.int64)
-
-    pads_name = constant(f"{mirrored}.pads", [0, 0, border_px, border_px] * 2)
     ends = [[crop_px] * 2, [-crop_px] * 2, [2, 3]]
-    places = [constant(f"{whole}.{k}", numbers) for k, numbers in enumerate(ends)]
-    pad = Node.new("Pad", [image, pads_name], mirrored, mode="reflect")
+    places = [
+        graph.add_constant(f"{whole}.{k}", numbers, np.int64) for k, numbers in enumerate(ends)
+    ]
     crop = Node.new("Slice", [whole, *places], result, f"{result}.cropped")
-    graph.set_nodes([pad, *graph.nodes, crop])
+    graph.set_nodes([graph.mirrored(image, border_px, mirrored), *graph.nodes, crop])
     graph.save()
 
 
 def _padded(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Return a convolution that pads by zeros what the Pad in front of it adds; None for others."""
-    pad = graph.writers.get(node.inputs[0]) if node.op_type == "Conv" else None
-    pads = pads_of(graph, pad) if pad is not None else ()
-    if pad is None or not pads:
+    pad = graph.writer(node.source)
+    pads = pads_of(graph, pad) if node.op_type == "Conv" else ()
+    if not pads:
         return None
     own = node.attributes.get("pads", [0] * 4)
     attributes = {**node.attributes, "pads": [sum(both) for both in zip(own, pads, strict=True)]}
-    inputs = [pad.inputs[0], *node.inputs[1:]]
-    return [Node.new("Conv", inputs, node.outputs[0], node.name, **attributes)]
+    return [node.replaced_by("Conv", [pad.source, *node.inputs[1:]], **attributes)]

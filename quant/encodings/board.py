@@ -23,8 +23,8 @@ from beers_deploy.quant.encodings.explicit import made_explicit
 from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Add, Conv, Op, Pointwise
 from beers_deploy.quant.graph.writer import onnx_weight, write_float
 from beers_deploy.quant.host_part import HostPart
-from beers_deploy.quant.onnx.graph import constants
 from beers_deploy.quant.onnx.image_input import fixed_tile_px, image_info
+from beers_deploy.quant.onnx.messages import constants
 from beers_deploy.quant.onnx_file import GraphWriter, make_model, metadata
 from beers_deploy.quant.untrusted import contradictions
 

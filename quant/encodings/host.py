@@ -53,8 +53,8 @@ from beers_deploy.quant.integer.arithmetic import (
     mean_factor,
     six_in_units,
 )
-from beers_deploy.quant.onnx.graph import constants
 from beers_deploy.quant.onnx.image_input import fixed_tile_px, image_info
+from beers_deploy.quant.onnx.messages import constants
 from beers_deploy.quant.onnx_file import make_model, metadata
 from beers_deploy.quant.untrusted import contradictions
 

@@ -10,7 +10,7 @@ That is another function. `quant.adapt` replaces the original by it, measures th
 compensates it.
 """
 
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import NO_NODE, Node, OnnxGraph
 from beers_deploy.quant.onnx.resize import Resizing, enlarged_bilinearly
 
 BETWEEN = {"Conv", "LeakyRelu", "PRelu", "Relu"}
@@ -29,18 +29,18 @@ def shrinking(graph: OnnxGraph, node: Node) -> list[Node]:
         In order: the convolution of stride 2, the maximum of stride 3, and the nodes between that
         and the Resize. The list is empty if the node is no Resize of an attention.
     """
-    nodes: list[Node] = []
-    writer = _writer(graph, node.source) if node.op_type == "Resize" else None
-    while writer is not None and (not nodes or nodes[0].op_type != "MaxPool"):
-        nodes.insert(0, writer)
-        writer = _writer(graph, writer.source)
-    if writer is None or not BETWEEN.issuperset(inner.op_type for inner in nodes[1:]):
+    if node.op_type != "Resize":
         return []
-    pool = nodes[0]
+    nodes: list[Node] = []
+    pool = _writer(graph, node.source)
+    while pool.op_type in BETWEEN:
+        nodes.insert(0, pool)
+        pool = _writer(graph, pool.source)
+    writer = _writer(graph, pool.source)
     weight = graph.value(writer, 1)
     # The pads and strides that `aligned` writes fit these kernels and strides only.
     is_attention = (
-        writer.op_type == "Conv"
+        (writer.op_type, pool.op_type) == ("Conv", "MaxPool")
         and weight is not None
         and weight.shape[2:] == (3, 3)
         and writer.attributes.get("strides") == [2, 2]
@@ -49,13 +49,13 @@ def shrinking(graph: OnnxGraph, node: Node) -> list[Node]:
         and not any([*writer.attributes.get("pads", []), *pool.attributes.get("pads", [])])
         and Resizing.of(graph, node).mode == "linear"
     )
-    return [writer, *nodes] if is_attention else []
+    return [writer, pool, *nodes] if is_attention else []
 
 
-def _writer(graph: OnnxGraph, name: str) -> Node | None:
-    """Return the node that writes a tensor; None if several nodes read its values."""
+def _writer(graph: OnnxGraph, name: str) -> Node:
+    """Return the node that writes a tensor; NO_NODE if several nodes read its values."""
     readers = [node for node in graph.readers[name] if node.op_type != "Shape"]
-    return graph.writers.get(name) if len(readers) == 1 else None
+    return graph.writer(name) if len(readers) == 1 else NO_NODE
 
 
 def aligned(graph: OnnxGraph, node: Node) -> dict[Node, list[Node]]:

@@ -15,9 +15,11 @@ import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.fold_affine import Affine, affine_chain
+from beers_deploy.quant.simplify.spelled_activations import squared
+from beers_deploy.quant.simplify.standard_operators import reduced_axes
 
-OVER_CHANNELS = (1,)
-OVER_IMAGE = (2, 3)
+OVER_CHANNELS = {1}
+OVER_IMAGE = {2, 3}
 RATIO = (np.pi / 2) ** 0.5
 """The standard deviation over the mean absolute deviation, of normally distributed values."""
 
@@ -53,21 +55,24 @@ class Deviation:
             node: any node; only a root can end one.
         """
         name, affine = scaled(graph, node.source if node.op_type == "Sqrt" else "")
-        variance = graph.writers.get(name)
+        variance = graph.writer(name)
         axes = _axes_of_mean(graph, variance)
-        square = graph.writers.get(variance.source) if variance is not None and axes else None
-        if square is None or square.op_type != "Mul" or len(set(square.inputs)) > 1:
-            return None
-        match = less_mean(graph, square.source)
+        match = less_mean(graph, squared(graph, variance.source))
         if match is None or match.axes != axes:
             return None
         *_, rows, columns = graph.shapes.get(match.source, (0, 0))
         is_of_pixels = axes == OVER_CHANNELS
         if rows != columns and not is_of_pixels:
             return None
-        scale = affine.scale
-        epsilon = float(affine.shift.max())
-        return cls(node, match.source, match.negative, is_of_pixels, rows, scale, epsilon)
+        return cls(
+            root=node,
+            source=match.source,
+            negative=match.negative,
+            is_of_pixels=is_of_pixels,
+            side_px=rows,
+            scale=affine.scale,
+            epsilon=float(affine.shift.max()),
+        )
 
     def nodes(self, graph: OnnxGraph) -> list[Node]:
         """Return the nodes that compute the mean absolute deviation in place of the root.
@@ -99,7 +104,7 @@ def above_mean(
     """
     wide, difference, positive = (f"{result}.{part}" for part in ("wide", "difference", "positive"))
     side_px = side_px or 1  # A network of free size is refused later, by its pooling.
-    scales = graph.add_constant(f"{wide}.scales", np.array([1, 1, side_px, side_px]))
+    scales = graph.add_constant(f"{wide}.scales", [1, 1, side_px, side_px])
     modes = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
     return [
         Node.new("Resize", [negative, "", scales], wide, **modes),
@@ -121,7 +126,7 @@ class LessMean:
 
     source: str
     negative: str
-    axes: tuple[int, ...]
+    axes: set[int]
 
 
 def less_mean(graph: OnnxGraph, name: str) -> LessMean | None:
@@ -131,29 +136,26 @@ def less_mean(graph: OnnxGraph, name: str) -> LessMean | None:
         graph: the graph of the tensor.
         name: the name of the tensor.
     """
-    difference = graph.writers.get(name)
-    if difference is None or difference.op_type != "Add":
-        return None
-    for source, negative in (difference.inputs, difference.inputs[::-1]):
+    difference = graph.writer(name)
+    for source, negative in difference.orders if difference.op_type == "Add" else ():
         mean_name, affine = scaled(graph, negative, is_sole=False)
-        mean = graph.writers.get(mean_name)
+        mean = graph.writer(mean_name)
         axes = _axes_of_mean(graph, mean)
         is_negative = (affine.scale == -1).all() and not affine.shift.any()
-        if mean is not None and axes and is_negative and mean.source == source:
+        if axes and is_negative and mean.source == source:
             return LessMean(source, negative, axes)
     return None
 
 
-def _axes_of_mean(graph: OnnxGraph, node: Node | None) -> tuple[int, ...]:
+def _axes_of_mean(graph: OnnxGraph, node: Node) -> set[int]:
     """Return the axes that a node takes the mean over, if it keeps them: OVER_IMAGE or
     OVER_CHANNELS; none for anything else.
     """
-    if node is None or node.op_type not in ("GlobalAveragePool", "ReduceMean"):
-        return ()
     if node.op_type == "GlobalAveragePool":
         return OVER_IMAGE
-    axes = tuple(axis % 4 for axis in graph.numbers(node, 1, "axes") or ())
-    return axes if axes == OVER_CHANNELS and node.attributes.get("keepdims", 1) else ()
+    is_kept = node.op_type == "ReduceMean" and node.attributes.get("keepdims", 1)
+    axes = reduced_axes(graph, node) if is_kept else set()
+    return axes if axes == OVER_CHANNELS else set()
 
 
 def scaled(graph: OnnxGraph, name: str, is_sole: bool = True) -> tuple[str, Affine]:
@@ -165,10 +167,10 @@ def scaled(graph: OnnxGraph, name: str, is_sole: bool = True) -> tuple[str, Affi
         is_sole: True to follow only tensors that nothing else reads.
     """
     name, affine = affine_chain(graph, name, is_sole)
-    node = graph.writers.get(name)
-    weight = graph.value(node, 1) if node is not None and node.op_type == "Conv" else None
+    node = graph.writer(name)
+    weight = graph.value(node, 1)
     # A convolution of one pixel that scales each channel, or repeats one.
-    if node is None or weight is None or weight.shape[1:] != (1, 1, 1):
+    if node.op_type != "Conv" or weight is None or weight.shape[1:] != (1, 1, 1):
         return name, affine
     bias = graph.value(node, 2)
     shift = affine.shift if bias is None else affine.scale * bias + affine.shift

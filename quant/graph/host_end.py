@@ -19,8 +19,8 @@ from beers_deploy.quant.graph.base import THE_IMAGE, Base, Mode
 from beers_deploy.quant.graph.node_operations import READERS
 from beers_deploy.quant.graph.operations import SIX, Shuffle
 from beers_deploy.quant.input_range import is_range
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph
-from beers_deploy.quant.onnx.resize import CUBIC, Resizing
+from beers_deploy.quant.onnx.graph import NO_NODE, Node, OnnxGraph
+from beers_deploy.quant.onnx.resize import Resizing
 from beers_deploy.quant.simplify.slices import slices_of
 
 ACTIVATIONS = {"Sigmoid", "Tanh"}
@@ -68,30 +68,25 @@ def host_end(graph: OnnxGraph) -> HostEnd:
     # 1.
     crop_px = _crop_px(graph, result)
     if crop_px:
-        replaced[result] = graph.writers[result].inputs[0]
+        replaced[result] = graph.writer(result).source
         result = replaced[result]
     limits: tuple[float, ...] = ()
     while ends := _limits(graph, result, limits):
         limits = ends
-        replaced[result] = graph.writers[result].inputs[0]
+        replaced[result] = graph.writer(result).source
         result = replaced[result]
     # 2.
     base, nodes = _sum_with_base(graph, result, image)
     replaced |= nodes
     result = replaced.get(result, result)
     # 3.
-    last = graph.sole_writer(result)
-    adds_image = last is not None and last.op_type == "Add" and image in last.inputs
-    activation = last
-    if adds_image and last is not None and base is None:
-        activation = graph.sole_writer(last.inputs[1 - last.inputs.index(image)])
-    if (
-        activation is None
-        or activation.op_type not in ACTIVATIONS
-        or activation.inputs[0] in graph.inputs
-    ):
+    activation = graph.sole_writer(result)
+    adds_image = activation.op_type == "Add" and image in activation.inputs
+    if adds_image and base is None:
+        activation = graph.sole_writer(activation.inputs[1 - activation.inputs.index(image)])
+    if activation.op_type not in ACTIVATIONS or activation.source in graph.inputs:
         return HostEnd(replaced, crop_px, limits, base, "", base is not None)
-    replaced[activation.outputs[0]] = activation.inputs[0]
+    replaced[activation.result] = activation.source
     is_last = base is not None or not adds_image
     return HostEnd(replaced, crop_px, limits, base, activation.op_type, is_last)
 
@@ -99,9 +94,7 @@ def host_end(graph: OnnxGraph) -> HostEnd:
 def _crop_px(graph: OnnxGraph, result: str) -> int:
     """Return the pixels that a Slice cuts off at each side of a tensor; 0 for another node."""
     node = graph.sole_writer(result)
-    if node is None or node.op_type != "Slice":
-        return 0
-    cuts = slices_of(graph, node)
+    cuts = slices_of(graph, node) if node.op_type == "Slice" else {}
     crop_px = cuts[2].start if 2 in cuts else 0
     both_sides = slice(crop_px, -crop_px, 1)
     return crop_px if cuts == {2: both_sides, 3: both_sides} else 0
@@ -114,15 +107,15 @@ def _limits(graph: OnnxGraph, result: str, limits: tuple[float, ...]) -> tuple[f
     ReLU6 is left to the DPU.
     """
     node = graph.sole_writer(result)
-    if node is None or node.op_type != "Clip":
+    if node.op_type != "Clip":
         return ()
     ends = [graph.value(node, place) for place in (1, 2)]
-    if any(end is None or end.size != 1 for end in ends):
+    numbers = [float(end.item()) for end in ends if end is not None and end.size == 1]
+    if len(numbers) < 2:
         return ()
-    low, high = (float(end.item()) for end in ends if end is not None)
-    if limits:
-        low = max(low, limits[0])
-        high = min(high, limits[1])
+    least, most = limits or (-np.inf, np.inf)
+    low = max(numbers[0], least)
+    high = min(numbers[1], most)
     return (low, high) if is_range(low, high) and (low, high) != (0, SIX) else ()
 
 
@@ -140,17 +133,17 @@ def _sum_with_base(graph: OnnxGraph, result: str, image: str) -> tuple[Base | No
     """
     total = graph.sole_writer(result)
     shuffle = None
-    if total is not None and total.op_type == "DepthToSpace":
+    if total.op_type == "DepthToSpace":
         shuffle = total
-        total = graph.sole_writer(shuffle.inputs[0])
-    if total is None or total.op_type != "Add":
-        return None, {}
-    for other, name in zip(total.inputs, total.inputs[::-1], strict=True):
-        base = _base(graph, name, image) if shuffle is None else _repeated(graph, name, shuffle)
+        total = graph.sole_writer(shuffle.source)
+    for other, name in total.orders if total.op_type == "Add" else ():
+        base = _repeated(graph, name, shuffle) if shuffle else _base(graph, name, image)
         if base is not None:
-            replaced = {total.outputs[0]: other}
+            replaced = {total.result: other}
             # The core may read it too.
-            return base, replaced | ({name: image} if graph.sole_writer(name) else {})
+            if graph.sole_writer(name) is not NO_NODE:
+                replaced[name] = image
+            return base, replaced
     return None, {}
 
 
@@ -158,10 +151,10 @@ def _base(graph: OnnxGraph, name: str, image: str) -> Base | None:
     """Return the base that a tensor is: channels of the image, or these enlarged in a way that the
     host computes alike at every place.
     """
-    node = graph.writers.get(name)
-    if node is None or node.op_type not in ("Resize", "Upsample"):
+    node = graph.writer(name)
+    if node.op_type not in ("Resize", "Upsample"):
         return _channels(graph, name)
-    source = THE_IMAGE if node.inputs[0] == image else _channels(graph, node.inputs[0])
+    source = THE_IMAGE if node.source == image else _channels(graph, node.source)
     resizing = Resizing.of(graph, node)
     if source is None or resizing.factors[:2] != (1, 1):
         return None
@@ -172,9 +165,7 @@ def _base(graph: OnnxGraph, name: str, image: str) -> Base | None:
         return replace(source, factor=factor) if resizing.makes_blocks(factor) else None
     # Sums of weights that are multiples of a power of two are rounded alike at every place.
     is_exact = factor & (factor - 1) == 0
-    is_plain = node.attributes.get("cubic_coeff_a", CUBIC) == CUBIC
-    is_plain = is_plain and not node.attributes.get("exclude_outside", 0)
-    if not (resizing.is_half_pixel and is_exact and is_plain):
+    if not (resizing.is_half_pixel and is_exact and resizing.is_plain):
         return None
     modes: dict[str, Mode] = {"linear": "linear", "cubic": "cubic"}
     return replace(source, factor=factor, mode=modes[resizing.mode])
@@ -210,11 +201,10 @@ def _copies(graph: OnnxGraph, name: str) -> np.ndarray | None:
     """Return the weights (O, C) if a tensor is a convolution of one pixel of the image, without
     bias; None for any other tensor.
     """
-    node = graph.writers.get(name)
-    if node is None or node.op_type != "Conv" or node.inputs[0] not in graph.inputs:
-        return None
-    weight = graph.value(node, 1)
-    is_plain = len(node.inputs) == 2 and node.attributes.get("group", 1) == 1
+    node = graph.writer(name)
+    is_of_image = node.op_type == "Conv" and node.source in graph.inputs
+    weight = graph.value(node, 1) if is_of_image else None
+    is_plain = len(node.inputs) == 2 and node.groups == 1
     if weight is None or weight.shape[2:] != (1, 1) or not is_plain:
         return None
     return weight[:, :, 0, 0]

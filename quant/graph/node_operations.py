@@ -25,6 +25,7 @@ from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.resize import Resizing, alone_enlarges_image
 from beers_deploy.quant.onnx.window import Pair, Window
 from beers_deploy.quant.simplify.convolutions import leaves_pads
+from beers_deploy.quant.simplify.spelled_activations import has_slope_of_dpu, slope_and_offset
 
 PAD_STRIDES = (
     "Pad strided convolutions and pools, so that their result has a half or a quarter of the size, "
@@ -238,9 +239,7 @@ def read_activation(graph: OnnxGraph, node: Node) -> Activation:
         remedy = OF_ONE_SENSOR if node.result == PLANES else REMEDY
         require(six, node, "must clip from 0 to 6 (ReLU6)", remedy)
     if node.op_type == "HardSigmoid":
-        alpha = node.attributes.get("alpha", 0.2)
-        beta = node.attributes.get("beta", 0.5)
-        plain = bool(np.isclose(alpha, 1 / 6, 1e-4)) and beta == 0.5
+        alpha, beta = slope_and_offset(node)
         rule = f"must have alpha 1/6 and beta 0.5, got {alpha:g} and {beta:g}"
-        require(plain, node, rule, ADAPT_EXACTLY)
+        require(has_slope_of_dpu(node), node, rule, ADAPT_EXACTLY)
     return activation

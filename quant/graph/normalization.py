@@ -92,9 +92,8 @@ class Normalization:
         size = graph.shapes.get(node.source, ())
         # A group normalisation has one of a map of three dimensions.
         is_square = len(size) == 4 and size[2] == size[3]
-        if node.op_type != "InstanceNormalization" or not is_square:
-            return None
-        if scale is None or shift is None:
+        is_of_kind = node.op_type == "InstanceNormalization" and is_square
+        if not is_of_kind or scale is None or shift is None:
             return None
         epsilon = float(node.attributes.get("epsilon", 1e-5))
         return cls(node, node.source, False, size[2], len(scale), scale, shift, epsilon)
@@ -103,8 +102,7 @@ class Normalization:
     def _of_quotient(cls, graph: OnnxGraph, node: Node) -> "Normalization | None":
         """Return the normalisation that is spelled out with a Div at its end."""
         root_name, of_root = scaled(graph, node.inputs[1], is_sole=False)
-        root = graph.writers.get(root_name)
-        deviation = None if root is None else Deviation.of(graph, root)
+        deviation = Deviation.of(graph, graph.writer(root_name))
         numerator, affine = affine_chain(graph, node.source)
         if deviation is None or affine.shift.any():
             return None
@@ -201,7 +199,7 @@ class Normalization:
         result = self.last.result
         mean = f"{result}.mean"
         negative = f"{result}.negative"
-        minus_one = graph.add_constant(f"{negative}.factor", np.array(-1))
+        minus_one = graph.add_constant(f"{negative}.factor", -1)
         return [
             Node.new("GlobalAveragePool", [in_units], mean),
             Node.new("Mul", [mean, minus_one], negative),
@@ -220,7 +218,9 @@ def lone_deviation(graph: OnnxGraph, node: Node) -> Deviation | None:
     deviation = Deviation.of(graph, node)
     if deviation is None or deviation.is_of_pixels:
         return None
-    quotients = [each for each in graph.nodes if each.op_type == "Div"]
-    normalizing = [each for each in quotients if Normalization.of(graph, each)]
-    roots = {scaled(graph, each.inputs[1], is_sole=False)[0] for each in normalizing}
+    roots = {
+        scaled(graph, each.inputs[1], is_sole=False)[0]
+        for each in graph.nodes
+        if each.op_type == "Div" and Normalization.of(graph, each)
+    }
     return None if node.result in roots else deviation

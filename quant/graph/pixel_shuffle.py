@@ -13,7 +13,8 @@ import numpy as np
 from onnx import ModelProto, TypeProto
 
 from beers_deploy.quant.graph.operations import Shuffle
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.messages import sizes_of
 
 MOVES: dict[str, tuple[str, Callable[[np.ndarray, list[int]], np.ndarray]]] = {
     "Reshape": (

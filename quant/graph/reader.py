@@ -49,7 +49,6 @@ from beers_deploy.quant.onnx.resize import Resizing
 from beers_deploy.quant.onnx.runnable import check_runnable
 from beers_deploy.quant.simplify.fold_affine import affine_of
 from beers_deploy.quant.simplify.simplify import simplify
-from beers_deploy.quant.simplify.standard_operators import float_shapes
 from beers_deploy.quant.untrusted import contradictions, times
 
 NO_IMAGE = (
@@ -147,7 +146,7 @@ class _Reader:
         """
         network = deepcopy(model)
         graph = OnnxGraph(network)
-        graph.shapes = float_shapes(graph)
+        graph.infer_shapes()
         plan: dict[Node, list[Node]] = {}
         for node in graph.nodes:
             if shrinking(graph, node):
@@ -176,7 +175,7 @@ class _Reader:
             return 0
         pad, border_px = mirror
         for node in source.readers[pad.result]:
-            node.inputs = tuple(self.image if n == pad.result else n for n in node.inputs)
+            node.read_instead(pad.result, self.image)
         source.set_nodes([node for node in source.nodes if node is not pad])
         return border_px
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike
+from numpy.typing import ArrayLike, DTypeLike
 from onnx import (
     ModelProto,
     NodeProto,
@@ -23,6 +23,7 @@ from onnx import (
 )
 
 from beers_deploy.quant.domains import Functions, functions_of, operator_name, opset_of
+from beers_deploy.quant.onnx.messages import constants, free_name, replace_all, sizes_of
 from beers_deploy.quant.onnx.window import Pair, Window
 
 WEIGHTS = {"Conv": 1, "ConvInteger": 1, "ConvTranspose": 1, "QLinearConv": 3}
@@ -111,6 +112,15 @@ class Node:
     def __str__(self) -> str:
         return f"{self.op_type} {self.name}"
 
+    @property
+    def orders(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """The inputs in both orders, to find an operand where the order does not matter."""
+        return self.inputs, self.inputs[::-1]
+
+    def read_instead(self, name: str, other: str) -> None:
+        """Let the node read another tensor wherever it reads `name`."""
+        self.inputs = tuple(other if each == name else each for each in self.inputs)
+
     def written(self) -> NodeProto:
         """Return the node as a message for a file, with its current inputs and outputs."""
         proto = NodeProto()
@@ -160,6 +170,8 @@ class Node:
         return self.attributes.get("output_padding", (0, 0))  # type: ignore[no-any-return]
 
 
+NO_NODE = Node("", "", (), ("",), {}, NodeProto())
+"""The writer of a tensor that no node writes. Its operator equals none."""
 Rewriting = Callable[["OnnxGraph", Node], list[Node] | None]
 """A function that returns the nodes that replace a node; None if it stays."""
 
@@ -248,8 +260,7 @@ class OnnxGraph:
                 nodes.append(node)
         self.set_nodes(nodes[::-1])
         graph = self._model.graph
-        del graph.node[:]
-        graph.node.extend(node.written() for node in self.nodes)
+        replace_all(graph.node, [node.written() for node in self.nodes])
         stored = {tensor.name for tensor in graph.initializer}
         new = {name: value for name, value in self.constants.items() if name not in stored}
         graph.initializer.extend(
@@ -269,6 +280,14 @@ class OnnxGraph:
         values = (*graph.input, *graph.value_info, *graph.output)
         return {value.name: value.type.tensor_type for value in values}
 
+    def infer_shapes(self) -> None:
+        """Infer the sizes of each float32 tensor of known rank, and store them in `shapes`."""
+        self.shapes = {
+            name: sizes_of(tensor)
+            for name, tensor in self.tensor_types().items()
+            if tensor.elem_type == TensorProto.FLOAT and tensor.HasField("shape")
+        }
+
     def channels(self, name: str) -> int:
         """Return the number of channels of a map (N, C, H, W); 0 if `shapes` does not state it."""
         sizes = self.shapes.get(name, ())
@@ -278,13 +297,16 @@ class OnnxGraph:
         """Return the number of times a tensor is read, by nodes and as a result of the model."""
         return len(self.readers.get(name, ())) + self.outputs.count(name)
 
-    def sole_writer(self, name: str) -> Node | None:
-        """Return the node that writes a tensor which is read exactly once; None for any other
-        tensor.
+    def writer(self, name: str) -> Node:
+        """Return the node that writes a tensor; NO_NODE if none does."""
+        return self.writers.get(name, NO_NODE)
+
+    def sole_writer(self, name: str) -> Node:
+        """Return the node that writes a tensor which is read exactly once; NO_NODE for others.
 
         Passes use it to change the node, because no other reader is affected.
         """
-        return self.writers.get(name) if self.n_reads(name) == 1 else None
+        return self.writer(name) if self.n_reads(name) == 1 else NO_NODE
 
     def rename(self, result: str, name: str) -> None:
         """Let the node that writes one tensor write another instead, whose node is then not needed.
@@ -297,16 +319,16 @@ class OnnxGraph:
         self.writers[name] = writer
         writer.outputs = tuple(name if output == result else output for output in writer.outputs)
 
-    def add_constant(self, name: str, value: np.ndarray, dtype: DTypeLike = np.float32) -> str:
+    def add_constant(self, name: str, value: ArrayLike, dtype: DTypeLike = np.float32) -> str:
         """Store a constant under a free name, and return that name.
 
         Args:
             name: the name to use; a number is added if it is taken.
-            value: the constant, of any shape.
+            value: the constant, a number or an array of any shape.
             dtype: the type in which it is stored.
         """
         name = free_name(name, self._name_counts)
-        self.constants[name] = value.astype(dtype)
+        self.constants[name] = np.array(value, dtype)
         return name
 
     def convolution(
@@ -333,6 +355,17 @@ class OnnxGraph:
             inputs.append(self.add_constant(f"{name}.bias", bias))
         attributes = {"kernel_shape": list(weight.shape[2:]), **attributes}
         return Node.new("Conv", inputs, output, name, **attributes)
+
+    def mirrored(self, source: str, border_px: int, output: str) -> Node:
+        """Build a Pad that mirrors a map beyond its borders.
+
+        Args:
+            source: the name of the map.
+            border_px: the number of pixels that are added at each side.
+            output: the name of the result.
+        """
+        pads = self.add_constant(f"{output}.pads", [0, 0, border_px, border_px] * 2, np.int64)
+        return Node.new("Pad", [source, pads], output, mode="reflect")
 
     def value(self, node: Node, place: int) -> np.ndarray | None:
         """Return the constant that a node reads as one of its inputs.
@@ -363,38 +396,3 @@ class OnnxGraph:
             value = self.value(node, place)
             return None if value is None else list(value.ravel().tolist())
         return list(node.attributes.get(key, ()))
-
-
-def constants(model: ModelProto) -> dict[str, np.ndarray]:
-    """Return the constants of a model by name: initializers, and the values of Constant nodes."""
-    arrays = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
-    functions = functions_of(model)
-    for node in model.graph.node:
-        if operator_name(node, functions) == "Constant" and node.attribute:
-            value = helper.get_attribute_value(node.attribute[0])
-            if isinstance(value, TensorProto):
-                value = numpy_helper.to_array(value)
-            # Exporters may store numbers as such: value_float, value_ints.
-            kind = np.float32 if "float" in node.attribute[0].name else None
-            arrays[node.output[0]] = np.asarray(value, kind)
-    return arrays
-
-
-def sizes_of(tensor: TypeProto.Tensor) -> tuple[int, ...]:
-    """Return the sizes that ONNX's type of a tensor states; 0 for a size that is not stated."""
-    return tuple(dim.dim_value for dim in tensor.shape.dim)
-
-
-def free_name(name: str, taken: dict[str, int]) -> str:
-    """Return a name that is not in use, and mark it as used.
-
-    Args:
-        name: the name to use; a suffix is added if it is in use.
-        taken: the number of names that were derived from each used name. It is changed.
-    """
-    candidate = name
-    while candidate in taken:
-        taken[name] += 1
-        candidate = f"{name}_{taken[name] if taken[name] > 1 else ''}"
-    taken[candidate] = 0
-    return candidate

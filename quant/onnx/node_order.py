@@ -8,6 +8,8 @@ from graphlib import CycleError, TopologicalSorter
 
 from onnx import GraphProto
 
+from beers_deploy.quant.onnx.messages import replace_all
+
 
 def sort_nodes(graph: GraphProto) -> None:
     """Sort the nodes of a graph in place, so that each reads only tensors that were written before.
@@ -32,5 +34,4 @@ def sort_nodes(graph: GraphProto) -> None:
     except CycleError:
         # A cycle has no order: the checker of ONNX names it.
         return
-    del graph.node[:]
-    graph.node.extend(nodes[number] for number in order)
+    replace_all(graph.node, [nodes[number] for number in order])

@@ -4,8 +4,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 
 PLACES: dict[str, Callable[[int, float], float]] = {
@@ -40,12 +38,14 @@ class Resizing:
         mode: the interpolation, in ONNX's words: "nearest", "linear" or "cubic".
         where: ONNX's `coordinate_transformation_mode`, the position of a pixel in the source.
         rounding: ONNX's `nearest_mode`, how a position is rounded to a pixel.
+        is_plain: True if cubic weights are ONNX's default, also at the border.
     """
 
     factors: tuple[float, ...]
     mode: str
     where: str
     rounding: str
+    is_plain: bool
 
     @classmethod
     def of(cls, graph: OnnxGraph, node: Node) -> "Resizing":
@@ -66,6 +66,7 @@ class Resizing:
             attribute("mode", "nearest"),
             attribute("coordinate_transformation_mode", "asymmetric" if old else "half_pixel"),
             attribute("nearest_mode", "floor" if old else "round_prefer_floor"),
+            attribute("cubic_coeff_a", CUBIC) == CUBIC and not attribute("exclude_outside", 0),
         )
 
     @property
@@ -112,7 +113,7 @@ def enlarged_bilinearly(graph: OnnxGraph, source: str, factor: int, node: Node) 
         enlarged *= step
         is_last = enlarged == factor
         result = node.result if is_last else f"{node.result}.{enlarged}"
-        scales = graph.add_constant(f"{result}.scales", np.array([1, 1, step, step]))
+        scales = graph.add_constant(f"{result}.scales", [1, 1, step, step])
         name = node.name if is_last else result
         nodes.append(Node.new("Resize", [source, "", scales], result, name, **modes))
         source = result
@@ -129,9 +130,7 @@ def enlarges_image(graph: OnnxGraph, node: Node) -> bool:
     if node.op_type != "Resize":
         return False
     resizing = Resizing.of(graph, node)
-    attribute = node.attributes.get
-    is_plain = attribute("cubic_coeff_a", CUBIC) == CUBIC and not attribute("exclude_outside", 0)
-    is_cubic = resizing.mode == "cubic" and resizing.is_half_pixel and is_plain
+    is_cubic = resizing.mode == "cubic" and resizing.is_half_pixel and resizing.is_plain
     return is_cubic and resizing.factors in BY_2_OR_4 and node.source in graph.inputs
 
 

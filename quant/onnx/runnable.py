@@ -12,7 +12,7 @@ from onnx import AttributeProto, ModelProto, NodeProto
 
 from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.domains import INLINE, MICROSOFT, STANDARD, foreign_remedy, opset_of
-from beers_deploy.quant.onnx.graph import constants
+from beers_deploy.quant.onnx.messages import constants
 from beers_deploy.quant.untrusted import RANK, check_size, times
 
 WINDOW_PX = 1024

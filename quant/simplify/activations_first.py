@@ -15,13 +15,13 @@ All of it is exact.
 """
 
 from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 from onnx import ModelProto
 
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import NO_NODE, Node, OnnxGraph
 from beers_deploy.quant.simplify.fold_affine import fold_in_front
-from beers_deploy.quant.simplify.standard_operators import float_shapes
 
 RISING = {"Clip", "LeakyRelu", "Relu"}
 ACTIVATIONS = RISING | {"HardSwish"}
@@ -71,7 +71,7 @@ def behind_convolutions(model: ModelProto) -> ModelProto:
     graph = OnnxGraph(network)
     if not any(_lacks_convolution(graph, node) for node in graph.nodes):
         return model
-    graph.shapes = float_shapes(graph)
+    graph.infer_shapes()
 
     def with_copy(graph: OnnxGraph, node: Node) -> list[Node] | None:
         source = node.source
@@ -94,8 +94,8 @@ def behind_convolutions(model: ModelProto) -> ModelProto:
 
 def _lacks_convolution(graph: OnnxGraph, node: Node) -> bool:
     """Return True for an activation or an inner pixel shuffle that no convolution precedes."""
-    before = graph.writers.get(node.source) if node.op_type in MAY_FOLLOW else None
-    if before is None or node.result in graph.outputs:
+    before = graph.writer(node.source)
+    if node.op_type not in MAY_FOLLOW or before is NO_NODE or node.result in graph.outputs:
         return False
     readers = {reader.op_type for reader in graph.readers[node.result]}
     if node.op_type == "DepthToSpace" and readers <= HOST:
@@ -120,10 +120,10 @@ def move_in_front(graph: OnnxGraph, node: Node) -> list[Node] | None:
         An activation of each tensor that the operation reads, and the operation. None if the node
         is no activation, or its input does not come from convolutions through such operations.
     """
-    moving = graph.sole_writer(node.source) if node.op_type in ACTIVATIONS else None
     # The host clips the result.
     is_end = node.op_type == "Clip" and node.result in graph.outputs
-    if moving is None or is_end or not _leads_to_convolutions(graph, node, moving):
+    moving = graph.sole_writer(node.source)
+    if node.op_type not in ACTIVATIONS or is_end or not _leads_to_convolutions(graph, node, moving):
         return None
     activations = [
         Node.new(
@@ -137,10 +137,7 @@ def move_in_front(graph: OnnxGraph, node: Node) -> list[Node] | None:
     ]
     results = [activation.result for activation in activations]
     others = moving.inputs[len(results) :]
-    moved = Node.new(
-        moving.op_type, (*results, *others), node.result, moving.name, **moving.attributes
-    )
-    return [*activations, moved]
+    return [*activations, replace(moving, inputs=(*results, *others), outputs=node.outputs)]
 
 
 def _values(moving: Node) -> tuple[str, ...]:
@@ -156,9 +153,7 @@ def _leads_to_convolutions(graph: OnnxGraph, activation: Node, writer: Node) -> 
     is_maximum = kind == "MaxPool" and rises and len(writer.outputs) == 1
     if not (kind in ("Concat", "DepthToSpace") or repeats or is_maximum):
         return False
-    writers = [graph.sole_writer(source) for source in _values(writer)]
     return all(
-        each is not None
-        and (each.op_type in CONVOLUTIONS or _leads_to_convolutions(graph, activation, each))
-        for each in writers
+        each.op_type in CONVOLUTIONS or _leads_to_convolutions(graph, activation, each)
+        for each in map(graph.sole_writer, _values(writer))
     )

@@ -41,9 +41,10 @@ class JoinBranches:
             return None
         if len(before) != 5 or node.source not in self._maps:
             return None
+        _, branches, channels, *_ = before
         if len(after) != 5:
-            return self._out_of(graph, node, before[1], before[2])
-        nodes = self._of_branches(graph, node, before[1], before[2])
+            return self._out_of(graph, node, branches, channels)
+        nodes = self._of_branches(graph, node, branches, channels)
         if not nodes:
             return None
         self._maps[node.result] = nodes[-1].result

@@ -17,13 +17,15 @@ A DPU adds and multiplies maps of one number of channels:
 All of it is exact. The divided nodes remain, and are removed if nothing reads them.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from onnx import ModelProto
 
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import NO_NODE, Node, OnnxGraph
+from beers_deploy.quant.onnx.window import Window
 from beers_deploy.quant.simplify.fold_affine import is_convolution
 from beers_deploy.quant.simplify.slices import slices_of
-from beers_deploy.quant.simplify.standard_operators import float_shapes
 
 POINTWISE = {"HardSigmoid", "HardSwish", "LeakyRelu", "Relu", "Sigmoid", "Tanh"}
 CHANNEL_AXIS = (1, -3)
@@ -61,7 +63,7 @@ def _parts(graph: OnnxGraph, node: Node) -> list[Part]:
         graph: the graph that the node belongs to.
         node: any node.
     """
-    numbers = np.arange(graph.channels(node.source) if node.inputs else 0)
+    numbers = np.arange(graph.channels(node.source))
     if not len(numbers):
         return []
     if node.op_type == "Split" and node.attributes.get("axis", 0) in CHANNEL_AXIS:
@@ -91,39 +93,36 @@ def _compute(
     """
     # A part may be divided again.
     graph.shapes[name] = (graph.shapes[source][0], len(channels), *graph.shapes[source][2:])
-    before = graph.writers.get(source) if divides else None
-    inner = f"{name}.before"
+    before = graph.writer(source) if divides else NO_NODE
+    front = before.source
     in_front = []
-    is_pointwise = before is not None and before.op_type in POINTWISE
+    is_pointwise = before.op_type in POINTWISE
     groups = _groups(graph, before)
-    if before is not None and (is_pointwise or groups > 1):
+    if is_pointwise or groups > 1:
         # An activation works on each value by itself, and a depthwise kernel on each channel, so
         # that the map in front has parts too.
-        reads_once = graph.n_reads(before.source) == 1
-        in_front = _compute(graph, before.source, channels, inner, reads_once)
-    if before is not None and is_pointwise:
-        behind = Node.of(before.written())
-        behind.proto.name = f"{name}.{before.op_type}"
-        behind.inputs = (inner,)
-        behind.outputs = (name,)
-        return [*in_front, behind]
-    if before is not None and groups:
+        inner = f"{name}.before"
+        in_front = _compute(graph, front, channels, inner, graph.n_reads(front) == 1)
+        front = inner
+    if is_pointwise:
+        kind = before.op_type
+        return [*in_front, Node.new(kind, [front], name, f"{name}.{kind}", **before.attributes)]
+    if groups:
         weight = graph.constants[before.inputs[1]][channels]
         bias = graph.value(before, 2)
         bias = bias if bias is None else bias[channels]
         attributes = {**before.attributes, "group": len(channels) if groups > 1 else 1}
-        front = inner if in_front else before.source
         conv = graph.convolution(front, name, f"{name}.Conv", weight, bias, **attributes)
         return [*in_front, conv]
     weight = np.eye(graph.shapes[source][1])[channels][..., None, None]
     return [graph.convolution(source, name, f"{name}.Conv", weight)]
 
 
-def _groups(graph: OnnxGraph, node: Node | None) -> int:
+def _groups(graph: OnnxGraph, node: Node) -> int:
     """Return the groups of a convolution whose channels can be computed separately, 0 for another
     node.
     """
-    if node is None or node.op_type != "Conv" or not is_convolution(graph, node):
+    if node.op_type != "Conv" or not is_convolution(graph, node):
         return 0
     outputs, inputs = graph.constants[node.inputs[1]].shape[:2]
     groups = node.groups
@@ -142,8 +141,8 @@ def read_unselected(graph: OnnxGraph, node: Node) -> list[Node] | None:
     Returns:
         The concat and the convolution; None if the node is something else.
     """
-    joined = graph.sole_writer(node.source) if _groups(graph, node) == 1 else None
-    if joined is None or joined.op_type != "Concat":
+    joined = graph.sole_writer(node.source)
+    if joined.op_type != "Concat" or _groups(graph, node) != 1:
         return None
     weight = graph.constants[node.inputs[1]]
     parts = []
@@ -154,8 +153,8 @@ def read_unselected(graph: OnnxGraph, node: Node) -> list[Node] | None:
         part = weight[:, first : first + width]
         first += width
         before = graph.sole_writer(name)
-        chosen = _selected(graph, before) if before is not None else None
-        if before is None or chosen is None or 2 * width < chosen.shape[1]:
+        chosen = _selected(graph, before)
+        if chosen is None or 2 * width < chosen.shape[1]:
             parts.append(name)
             columns.append(part)
         else:
@@ -166,9 +165,7 @@ def read_unselected(graph: OnnxGraph, node: Node) -> list[Node] | None:
     name = f"{node.name}.whole"
     concat = Node.new("Concat", parts, name, axis=1)
     wide = graph.add_constant(f"{name}.weight", np.concatenate(columns, 1))
-    behind = Node.of(node.written())
-    behind.inputs = (name, wide, *node.inputs[2:])
-    return [concat, behind]
+    return [concat, replace(node, inputs=(name, wide, *node.inputs[2:]))]
 
 
 def _selected(graph: OnnxGraph, node: Node) -> np.ndarray | None:
@@ -178,8 +175,7 @@ def _selected(graph: OnnxGraph, node: Node) -> np.ndarray | None:
     if _groups(graph, node) != 1 or graph.value(node, 2) is not None:
         return None
     weight = graph.constants[node.inputs[1]]
-    is_one_pixel = weight.shape[2:] == (1, 1) and not any(node.attributes.get("pads", []))
-    is_one_pixel = is_one_pixel and set(node.attributes.get("strides", [1])) == {1}
+    is_one_pixel = node.window(weight.shape[2:]) == ((1, 1), Window())
     is_selection = ((weight == 0) | (weight == 1)).all() and (weight.sum((1, 2, 3)) == 1).all()
     return weight[:, :, 0, 0] if is_one_pixel and is_selection else None
 
@@ -211,7 +207,7 @@ def repeat_channels(graph: OnnxGraph, node: Node) -> list[Node] | None:
     channels = max(graph.channels(name) for name in node.inputs)
     name = f"{result}.repeated"
     repeated = graph.convolution(narrow, name, name, np.ones((channels, 1, 1, 1)))
-    node.inputs = tuple(name if each == narrow else each for each in node.inputs)
+    node.read_instead(narrow, name)
     return [repeated, node]
 
 
@@ -222,7 +218,7 @@ def broadcasts_channels(model: ModelProto) -> bool:
         model: a float network of few kinds of operators, whose channels ONNX can infer.
     """
     graph = OnnxGraph(model)
-    graph.shapes = float_shapes(graph)
+    graph.infer_shapes()
     return any(_narrow_input(graph, node) is not None for node in graph.nodes)
 
 

@@ -48,13 +48,15 @@ def channels_first(model: ModelProto) -> None:
         return
     images = _images_of_channels_last(graph)
     for name in sorted(images):
-        _read_instead(graph, name, f"{name}.last")
+        for node in graph.readers[name]:
+            node.read_instead(name, f"{name}.last")
         first = Node.new("Transpose", [name], f"{name}.last", perm=TO_LAST)
         graph.set_nodes([first, *graph.nodes])
     graph.rewrite(moved_behind)
     results = {name for name in graph.outputs if _is_last(graph, name, bool(images))}
     for name in sorted(results):
-        _read_instead(graph, name, f"{name}.last")
+        for node in graph.readers[name]:
+            node.read_instead(name, f"{name}.last")
         graph.rename(name, f"{name}.last")
         first = Node.new("Transpose", [f"{name}.last"], name, f"{name}.first", perm=TO_FIRST)
         graph.set_nodes([*graph.nodes, first])
@@ -66,12 +68,6 @@ def channels_first(model: ModelProto) -> None:
             channels = dims.pop()
             dims.insert(1, channels)
             model.graph.ClearField("value_info")
-
-
-def _read_instead(graph: OnnxGraph, name: str, other: str) -> None:
-    """Let all readers of a tensor read another one instead."""
-    for node in graph.readers[name]:
-        node.inputs = tuple(other if each == name else each for each in node.inputs)
 
 
 def _is_last(graph: OnnxGraph, name: str, has_images: bool) -> bool:
@@ -228,7 +224,7 @@ def _on_first(graph: OnnxGraph, node: Node, sources: Mapping[str, str], first: s
         if number is None:
             attributes["axes"] = moved_axes
         else:
-            inputs.append(graph.add_constant(f"{first}.axes", np.array(moved_axes), np.int64))
+            inputs.append(graph.add_constant(f"{first}.axes", moved_axes, np.int64))
         return Node.new(kind, inputs, first, node.name, **attributes) if axes else None
     if kind in ("Concat", "Split"):
         attributes["axis"] = TO_LAST[attributes.get("axis", 0) % 4]
@@ -262,7 +258,7 @@ def _layer_normalization(graph: OnnxGraph, node: Node, source: str, first: str) 
     axes = []
     attributes: dict[str, Any] = {"axes": [1]}
     if graph.opset >= AXES_ARE_INPUT:
-        axes.append(graph.add_constant(f"{first}.axes", np.array([1]), np.int64))
+        axes.append(graph.add_constant(f"{first}.axes", [1], np.int64))
         attributes = {}
     epsilon = np.array(node.attributes.get("epsilon", 1e-5))
     return [

@@ -42,6 +42,12 @@ def leaves_pads(node: Node) -> bool:
     return is_same and any(stride > 1 for stride in node.attributes.get("strides", [1]))
 
 
+def states_pads(node: Node) -> bool:
+    """Return True if a transposed convolution states its pads, and no size of its result."""
+    attributes = node.attributes
+    return attributes.get("auto_pad", "NOTSET") == "NOTSET" and "output_shape" not in attributes
+
+
 def without_groups(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a convolution of groups or output padding by one without.
 
@@ -58,11 +64,8 @@ def without_groups(graph: OnnxGraph, node: Node) -> list[Node] | None:
     groups = node.groups
     rows, columns, *_ = node.output_padding
     is_depthwise = node.op_type == "Conv" and weight.shape[1] == 1 and len(weight) == groups
-    auto_pad = node.attributes.get("auto_pad", "NOTSET")
-    states_pads = auto_pad == "NOTSET" and "output_shape" not in node.attributes
-    is_dilated = set(node.attributes.get("dilations", [1])) != {1}
     if rows or columns:
-        if not states_pads or is_dilated:
+        if not states_pads(node) or set(node.attributes.get("dilations", [1])) != {1}:
             return None
     elif groups == 1 or is_depthwise:
         return None
@@ -96,11 +99,12 @@ def crop_by_pads(graph: OnnxGraph, node: Node) -> list[Node] | None:
     Returns:
         The convolution; None if the node is something else.
     """
-    before = graph.sole_writer(node.source) if node.op_type == "Slice" else None
-    cuts = slices_of(graph, node) if before is not None else {}
-    if before is None or before.op_type != "ConvTranspose" or not cuts.keys() <= {2, 3}:
+    before = graph.sole_writer(node.source)
+    if (node.op_type, before.op_type) != ("Slice", "ConvTranspose"):
         return None
-    states_pads = before.attributes.get("auto_pad", "NOTSET") == "NOTSET"
+    cuts = slices_of(graph, node)
+    if not cuts or not cuts.keys() <= {2, 3} or not states_pads(before):
+        return None
     pads = list(before.attributes.get("pads", [0] * 4))
     for axis, cut in cuts.items():
         # Stops count from the end.
@@ -109,8 +113,6 @@ def crop_by_pads(graph: OnnxGraph, node: Node) -> list[Node] | None:
             return None
         pads[axis - 2] += cut.start
         pads[axis] -= stop
-    if not cuts or not states_pads or "output_shape" in before.attributes:
-        return None
     return [node.replaced_by("ConvTranspose", before.inputs, **{**before.attributes, "pads": pads})]
 
 

@@ -41,6 +41,10 @@ class Affine:
         return max(len(self.scale), len(self.shift))
 
 
+IDENTITY = Affine(np.ones(1), np.zeros(1))
+NEGATION = Affine(-np.ones(1), np.zeros(1))
+
+
 def add_negated(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a - b by a + (-b), where the convolution that computes b is negated, or a product by
     -1 is new (point 1 of the module).
@@ -57,12 +61,12 @@ def add_negated(graph: OnnxGraph, node: Node) -> list[Node] | None:
         return None
     result = node.result
     before = graph.sole_writer(node.inputs[1])
-    if before is not None and is_convolution(graph, before):
+    if is_convolution(graph, before):
         # This is done at once, so that the tensor keeps its name.
-        _fold(graph, before, Affine(-np.ones(1), np.zeros(1)), into_results=True)
+        _fold(graph, before, NEGATION, into_results=True)
         return [Node.new("Add", node.inputs, result, node.proto.name)]
     name = f"{result}.negated"
-    factor = graph.add_constant(f"{name}.factor", np.array(-1))
+    factor = graph.add_constant(f"{name}.factor", -1)
     return [
         Node.new("Mul", [node.inputs[1], factor], name),
         Node.new("Add", [node.source, name], result, node.proto.name),
@@ -86,9 +90,7 @@ def fold_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
         return None
     source, affine = match
     before = graph.sole_writer(source)
-    if before is None or not is_convolution(graph, before):
-        return None
-    if affine.channels not in (1, _width(graph, before)):
+    if not is_convolution(graph, before) or affine.channels not in (1, _width(graph, before)):
         return None
     _fold(graph, before, affine, into_results=True)
     graph.rename(source, node.result)
@@ -177,14 +179,14 @@ def affine_of(graph: OnnxGraph, node: Node) -> tuple[str, Affine] | None:
         scale = gain / np.sqrt(variance + node.attributes.get("epsilon", 1e-5))
         return node.source, Affine(scale, offset - mean * scale)
     if node.op_type == "Neg":
-        return node.source, Affine(-np.ones(1), np.zeros(1))
+        return node.source, NEGATION
     if node.op_type not in ("Add", "Div", "Mul", "Sub"):
         return None
-    for place in (0, 1):
+    for place, source in enumerate(node.inputs):
         value = per_channel(_float64(graph, node, 1 - place))
-        if value is not None and node.inputs[place] not in graph.constants:
+        if value is not None and source not in graph.constants:
             affine = _arithmetic(node.op_type, value, place)
-            return None if affine is None else (node.inputs[place], affine)
+            return None if affine is None else (source, affine)
     return None
 
 
@@ -199,15 +201,11 @@ def affine_chain(graph: OnnxGraph, name: str, is_sole: bool = True) -> tuple[str
     Returns:
         The tensor in front of the first of them, and their joint scaling and shift.
     """
-    one = np.ones(1)
-    total = Affine(one, 0 * one)
-    while True:
-        writer = graph.sole_writer(name) if is_sole else graph.writers.get(name)
-        match = None if writer is None else affine_of(graph, writer)
-        if match is None:
-            return name, total
+    total = IDENTITY
+    while match := affine_of(graph, graph.sole_writer(name) if is_sole else graph.writer(name)):
         name, affine = match
         total = Affine(total.scale * affine.scale, total.scale * affine.shift + total.shift)
+    return name, total
 
 
 def _arithmetic(kind: str, value: np.ndarray, place: int) -> Affine | None:
@@ -261,8 +259,7 @@ def _width(graph: OnnxGraph, node: Node) -> int:
     """Return the channels that a convolution writes."""
     shape = graph.constants[node.inputs[1]].shape
     # A transposed convolution has weights (I, O / groups, kh, kw).
-    groups = node.groups
-    return int(shape[0] if node.op_type == "Conv" else shape[1] * groups)
+    return int(shape[0] if node.op_type == "Conv" else shape[1] * node.groups)
 
 
 def _fold(graph: OnnxGraph, node: Node, affine: Affine, into_results: bool) -> None:

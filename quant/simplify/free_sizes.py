@@ -24,8 +24,9 @@ import numpy as np
 from onnx import ModelProto
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Rewriting, sizes_of
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Rewriting
 from beers_deploy.quant.onnx.image_input import without_size
+from beers_deploy.quant.onnx.messages import replace_all
 from beers_deploy.quant.simplify.channels_first import TO_LAST, moved_behind, multiplied
 from beers_deploy.quant.simplify.convolutions import leaves_pads
 from beers_deploy.quant.simplify.fold_affine import affine_chain
@@ -105,10 +106,8 @@ def free_sizes(model: ModelProto, fold: Fold) -> ModelProto:
     if first.graph.node != second.graph.node or first_constants != second_constants:
         return model
     # The sizes that the file states are as free as before.
-    del first.graph.input[:]
-    first.graph.input.extend(model.graph.input)
-    del first.graph.output[:]
-    first.graph.output.extend(model.graph.output)
+    replace_all(first.graph.input, model.graph.input)
+    replace_all(first.graph.output, model.graph.output)
     first.graph.ClearField("value_info")
     return first
 
@@ -136,7 +135,7 @@ def _of_size(model: ModelProto, rows: int, columns: int, fold: Fold) -> ModelPro
     network = fold(network)
     network.graph.ClearField("value_info")
     graph = OnnxGraph(network)
-    graph.shapes = {name: sizes_of(tensor) for name, tensor in graph.tensor_types().items()}
+    graph.infer_shapes()
     graph.rewrite(_sized)
     graph.rewrite(moved_behind)
     graph.save()
@@ -188,7 +187,7 @@ def _cropped(graph: OnnxGraph, node: Node) -> list[Node] | None:
         list(cuts),
     )
     places = [
-        graph.add_constant(f"{node.name}.{role}", np.array(values), np.int64)
+        graph.add_constant(f"{node.name}.{role}", values, np.int64)
         for role, values in zip(("starts", "stops", "axes"), numbers, strict=True)
     ]
     return [node.replaced_by("Slice", [node.source, *places])]

@@ -11,6 +11,7 @@
 A flattening remains behind each of them, and is removed if nothing reads it.
 """
 
+from dataclasses import replace
 from math import prod
 
 import numpy as np
@@ -54,9 +55,7 @@ class ConnectByConvolutions:
         operand = graph.value(node, 1)
         is_scaled = node.op_type in ARITHMETIC and operand is not None and operand.size == 1
         if node.op_type in POINTWISE or is_scaled:
-            image = Node.of(node.written())
-            image.inputs = (source, *node.inputs[1:])
-            return self._flat(image, size)
+            return self._flat(replace(node, inputs=(source, *node.inputs[1:])), size)
         is_private = (
             graph.n_reads(name) == 1 and graph.n_reads(source) <= 1 and source in graph.writers
         )
@@ -86,12 +85,9 @@ class ConnectByConvolutions:
         """Return the convolution that computes a Gemm on a map of this size (2)."""
         weight = graph.value(node, 1)
         bias = graph.value(node, 2)
-        has_bias = len(node.inputs) > 2 and node.inputs[2] != ""
-        bias = bias if has_bias else np.zeros(1, np.float32)
-        if weight is None or bias is None or {weight.dtype, bias.dtype} != {np.dtype(np.float32)}:
-            return None
+        bias = bias if any(node.inputs[2:]) else np.zeros(1)
         attribute = node.attributes.get
-        if weight.ndim != 2 or attribute("transA", 0):
+        if weight is None or bias is None or weight.ndim != 2 or attribute("transA", 0):
             return None
         weight = weight if attribute("transB", 0) else weight.T
         if weight.shape[1] != prod(size) or bias.size not in (1, len(weight)):
@@ -126,17 +122,13 @@ def connect_neighbours(graph: OnnxGraph, node: Node) -> list[Node] | None:
     if node.op_type not in MOVES or not channels or size[2:] != (1, 1):
         return None
     activations, convolution = _in_front(graph, result, MOVES | POINTWISE)
-    weight = graph.value(convolution, 1) if convolution is not None else None
-    if convolution is None or convolution.op_type != "Conv" or len(convolution.inputs) != 2:
+    weight = graph.value(convolution, 1)
+    if convolution.op_type != "Conv" or len(convolution.inputs) != 2:
         return None
     # Nodes that move values keep the order of the channels, because each other size is 1.
-    _, before = _in_front(graph, convolution.source, MOVES)
-    source = before.result if before is not None else ""
-    if (
-        weight is None
-        or weight.shape[:-1] != (1, 1)
-        or graph.shapes.get(source, ())[1:] != size[1:]
-    ):
+    source = _in_front(graph, convolution.source, MOVES)[1].result
+    is_of_channels = weight is not None and weight.shape[:-1] == (1, 1)
+    if weight is None or not is_of_channels or graph.shapes.get(source, ())[1:] != size[1:]:
         return None
     taps = weight.ravel()
     pad = len(taps) // 2
@@ -147,23 +139,19 @@ def connect_neighbours(graph: OnnxGraph, node: Node) -> list[Node] | None:
     band = sum(tap * np.eye(channels, k=k - pad) for k, tap in enumerate(taps))
     nodes = [graph.convolution(source, f"{result}.0", convolution.name, band[..., None, None])]
     for number, activation in enumerate(activations, 1):
-        inputs = [f"{result}.{number - 1}", *activation.inputs[1:]]
-        copy = Node.of(activation.written())
-        copy.inputs = tuple(inputs)
-        copy.outputs = (f"{result}.{number}",)
-        nodes.append(copy)
+        inputs = (nodes[-1].result, *activation.inputs[1:])
+        nodes.append(replace(activation, inputs=inputs, outputs=(f"{result}.{number}",)))
     nodes[-1].outputs = (result,)
     return nodes
 
 
-def _in_front(graph: OnnxGraph, name: str, skipped: set[str]) -> tuple[list[Node], Node | None]:
+def _in_front(graph: OnnxGraph, name: str, skipped: set[str]) -> tuple[list[Node], Node]:
     """Return the first node in front of a tensor whose operator is not to be skipped, and the
     activations between, in order.
     """
     activations: list[Node] = []
-    node = graph.writers.get(name)
-    while node is not None and node.op_type in skipped:
+    while (node := graph.writer(name)).op_type in skipped:
         if node.op_type in POINTWISE:
             activations.insert(0, node)
-        node = graph.writers.get(node.source)
+        name = node.source
     return activations, node

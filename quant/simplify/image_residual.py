@@ -42,21 +42,15 @@ def clip_last(graph: OnnxGraph, node: Node) -> list[Node] | None:
     is_last = source == node.result
     clip = node if is_last else graph.sole_writer(source)
     clipped, *limits, count = joint_limits(graph, clip)
-    if (
-        clip is None
-        or not np.isfinite(limits).all()
-        or affine.channels > 1
-        or not affine.scale.all()
-    ):
-        return None
-    if is_last and count == 1:
+    is_limited = count > 0 and np.isfinite(limits).all()
+    if not is_limited or affine.channels > 1 or not affine.scale.all() or (is_last and count == 1):
         return None
     name = node.result
     # A negative scale exchanges the two limits.
     low, high = sorted((affine.scale * limit + affine.shift).item() for limit in limits)
     ends = [
-        graph.add_constant(f"{name}.low", np.array(low)),
-        graph.add_constant(f"{name}.high", np.array(high)),
+        graph.add_constant(f"{name}.low", low),
+        graph.add_constant(f"{name}.high", high),
     ]
     nodes = [] if is_last else _scaled(graph, clipped, name, affine)
     last = nodes[-1].result if nodes else clipped
@@ -85,17 +79,17 @@ def add_to_image(graph: OnnxGraph, node: Node) -> list[Node] | None:
         A product and the sum; None if the node does not undo the normalisation of the image.
     """
     source, behind = affine_chain(graph, node.result)
-    total = graph.writers.get(source)
-    if source == node.result or total is None or total.op_type != "Add":
+    total = graph.writer(source)
+    if source == node.result or total.op_type != "Add":
         return None
-    for place, name in enumerate(total.inputs):
+    for name, other in total.orders:
         image, before = affine_chain(graph, name, is_sole=False)
         if image in graph.inputs and name != image and _undoes(behind, before, graph.inputs[image]):
             result = node.result
             factor = graph.add_constant(f"{result}.scale", behind.scale.reshape(1, -1, 1, 1))
             correction = f"{result}.correction"
             return [
-                Node.new("Mul", [total.inputs[1 - place], factor], correction),
+                Node.new("Mul", [other, factor], correction),
                 node.replaced_by("Add", [image, correction]),
             ]
     return None

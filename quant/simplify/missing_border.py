@@ -14,7 +14,8 @@ from copy import deepcopy
 import numpy as np
 from onnx import ModelProto, shape_inference
 
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
+from beers_deploy.quant.onnx.graph import OnnxGraph
+from beers_deploy.quant.onnx.messages import sizes_of
 
 WINDOWS = {"AveragePool", "Conv", "MaxPool"}
 """Operators whose pads add pixels around a map; those of a transposed convolution cut its result.
@@ -57,11 +58,8 @@ def with_missing_border(model: ModelProto) -> ModelProto:
     image = network.graph.input[0].name
     mirrored = f"{image}.mirrored"
     for node in graph.readers[image]:
-        node.inputs = tuple(mirrored if name == image else name for name in node.inputs)
-    amounts = np.array([0, 0, border_px, border_px] * 2)
-    pads = graph.add_constant(f"{mirrored}.pads", amounts, np.int64)
-    pad = Node.new("Pad", [image, pads], mirrored, mode="reflect")
-    graph.set_nodes([pad, *graph.nodes])
+        node.read_instead(image, mirrored)
+    graph.set_nodes([graph.mirrored(image, border_px, mirrored), *graph.nodes])
     graph.save()
     return network
 

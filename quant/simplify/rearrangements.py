@@ -17,6 +17,7 @@ All of it is exact.
 """
 
 import math
+from functools import partial, reduce
 
 import numpy as np
 
@@ -40,12 +41,8 @@ MOST_VALUES = 1 << 24
 def is_rearrangement(graph: OnnxGraph, node: Node) -> bool:
     """Return True if a node may belong to a chain that moves values, behind the image."""
     perm = node.attributes.get("perm", ())
-    before = graph.writers.get(node.source)
-    is_read_as_shuffle = (
-        perm in PIXEL_SHUFFLES.values()
-        and before is not None
-        and graph.value(before, 1) is not None
-    )
+    sizes = graph.value(graph.writer(node.source), 1)
+    is_read_as_shuffle = perm in PIXEL_SHUFFLES.values() and sizes is not None
     is_one = len(perm) > 4 and not is_read_as_shuffle
     return (
         node.op_type in ("GatherND", "Tile")
@@ -77,7 +74,7 @@ def rearranged(graph: OnnxGraph, node: Node) -> list[Node] | None:
     if len(before) != 4 or len(after) != 4 or not 0 < math.prod(before) <= MOST_VALUES:
         return None
     image = np.arange(math.prod(before)).reshape(before)
-    moved = _results(graph, image, chain)
+    moved = reduce(partial(_moved, graph), chain, image)
     if np.array_equal(moved, image):
         return [node.replaced_by("Identity", [source])]
     if after[2] > before[2]:
@@ -106,7 +103,7 @@ def _enlarged(
     """Return the operator that enlarges a map of numbers so; None if it is no enlargement (2)."""
     factor = moved.shape[2] // image.shape[2]
     if np.array_equal(moved, image.repeat(factor, 2).repeat(factor, 3)):
-        scales = graph.add_constant(f"{node.result}.scales", np.array([1, 1, factor, factor]))
+        scales = graph.add_constant(f"{node.result}.scales", [1, 1, factor, factor])
         return [node.replaced_by("Resize", [source, "", scales], **OF_BLOCKS)]
     batch, channels, *_ = moved.shape
     blocks = batch, channels, image.shape[2], factor, image.shape[3], factor
@@ -121,18 +118,9 @@ def _enlarged(
 def _chain(graph: OnnxGraph, node: Node) -> tuple[str, list[Node]]:
     """Return the tensor that a chain up to this node begins with, and its nodes in order."""
     chain = [node]
-    writer = graph.writers.get(node.source)
-    while writer is not None and writer.op_type in MOVING:
+    while (writer := graph.writer(chain[0].source)).op_type in MOVING:
         chain.insert(0, writer)
-        writer = graph.writers.get(writer.source)
     return chain[0].source, chain
-
-
-def _results(graph: OnnxGraph, values: np.ndarray, chain: list[Node]) -> np.ndarray:
-    """Return the result of a chain of nodes for these values."""
-    for node in chain:
-        values = _moved(graph, values, node)
-    return values
 
 
 def _moved(graph: OnnxGraph, values: np.ndarray, node: Node) -> np.ndarray:
@@ -144,13 +132,12 @@ def _moved(graph: OnnxGraph, values: np.ndarray, node: Node) -> np.ndarray:
         return np.broadcast_to(values, size)
     if node.op_type == "Tile":
         return np.tile(values, np.floor_divide(size, values.shape))
-    if node.op_type == "Gather":
-        chosen = graph.value(node, 1)
-        axis = node.attributes.get("axis", 0)
-        return np.full(size, -1) if chosen is None else values.take(chosen, axis)
-    if node.op_type == "GatherND":
-        chosen = graph.value(node, 1)
-        is_of_first_axis = chosen is not None and chosen.ndim == 2 and chosen.shape[1] == 1
-        # A number that no map has.
-        return values[chosen[:, 0]] if is_of_first_axis else np.full(size, -1)  # type: ignore[index]
-    return values.reshape(size)
+    if node.op_type not in ("Gather", "GatherND"):
+        return values.reshape(size)
+    chosen = graph.value(node, 1)
+    if chosen is not None and node.op_type == "Gather":
+        return np.asarray(values.take(chosen, node.attributes.get("axis", 0)))
+    if chosen is not None and chosen.ndim == 2 and chosen.shape[1] == 1:
+        return np.asarray(values[chosen[:, 0]])
+    # A number that no map has.
+    return np.full(size, -1)

@@ -54,7 +54,8 @@ from onnx.shape_inference import InferenceError
 
 from beers_deploy.profiles.errors import ModelError, reason_of
 from beers_deploy.quant.domains import IR_VERSION, OPSET, opset_of
-from beers_deploy.quant.onnx.graph import OnnxGraph, Rewriting, free_name
+from beers_deploy.quant.onnx.graph import OnnxGraph, Rewriting
+from beers_deploy.quant.onnx.messages import free_name, replace_all
 from beers_deploy.quant.simplify.activations_first import (
     activations_first,
     behind_convolutions,
@@ -95,7 +96,6 @@ from beers_deploy.quant.simplify.standard_operators import (
     divide_by_reciprocal,
     drop_cast_or_reshape,
     drop_where,
-    float_shapes,
     pool_maximum,
     pool_mean,
     pool_sums,
@@ -162,7 +162,7 @@ def _simplified(model: ModelProto, where: str) -> ModelProto:
     outputs = list(network.graph.output)
     # An initializer that is an input too could be replaced when the network runs, so that the
     # runtime would fold nothing that reads it.
-    _replace(network.graph.input, inputs)
+    replace_all(network.graph.input, inputs)
     network.ir_version = IR_VERSION
     # Sizes that an older operator holds itself become constants first, which are then folded.
     if opset_of(model) < OPSET:
@@ -170,8 +170,8 @@ def _simplified(model: ModelProto, where: str) -> ModelProto:
     network = free_sizes(_folded(network, where), partial(_folded, where=where))
     _run_passes(network)
     # Inputs and outputs stay as the file states them.
-    _replace(network.graph.input, inputs)
-    _replace(network.graph.output, outputs)
+    replace_all(network.graph.input, inputs)
+    replace_all(network.graph.output, outputs)
     _tidy(network, model)
     return network
 
@@ -179,7 +179,7 @@ def _simplified(model: ModelProto, where: str) -> ModelProto:
 def _run_passes(model: ModelProto) -> None:
     """Rewrite the nodes of a network in place, without renaming its inputs and outputs."""
     graph = OnnxGraph(model)
-    graph.shapes = float_shapes(graph)
+    graph.infer_shapes()
     for replacement in (
         JoinBranches(),
         clip_last,
@@ -192,7 +192,7 @@ def _run_passes(model: ModelProto) -> None:
         graph.rewrite(replacement)
     # Nodes that were replaced would count as readers.
     graph.save()
-    graph.shapes = float_shapes(graph)
+    graph.infer_shapes()
     for rewriting in (
         split_sums,
         join_clips,
@@ -208,7 +208,7 @@ def _run_passes(model: ModelProto) -> None:
     ):
         graph.rewrite(rewriting)
     graph.save()
-    graph.shapes = float_shapes(graph)
+    graph.infer_shapes()
     fold_in_front(graph)
     for with_shapes in (
         repeat_channels,
@@ -319,7 +319,7 @@ def _folded(model: ModelProto, where: str) -> ModelProto:
 def _of_our_opset(model: ModelProto) -> ModelProto:
     """Convert a network to this project's opset; return it unchanged if that is not possible."""
     version = opset_of(model)
-    _replace(model.opset_import, [helper.make_opsetid("", version)])
+    replace_all(model.opset_import, [helper.make_opsetid("", version)])
     if version == OPSET:
         return model
     try:
@@ -333,12 +333,12 @@ def _of_our_opset(model: ModelProto) -> ModelProto:
             modes = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
             attributes = [a for a in node.attribute if a.name not in modes]
             attributes += [helper.make_attribute(*mode) for mode in modes.items()]
-            _replace(node.attribute, attributes)
+            replace_all(node.attribute, attributes)
         # The converter leaves attributes that the operator of our opset lacks. onnxruntime has
         # written their defaults.
         if version > OPSET:
             newer, ours = (defs.get_schema(node.op_type, v).attributes for v in (version, OPSET))
-            _replace(
+            replace_all(
                 node.attribute,
                 [a for a in node.attribute if a.name in ours or a != newer[a.name].default_value],
             )
@@ -353,7 +353,7 @@ def _tidy(network: ModelProto, model: ModelProto) -> None:
     network.ir_version = IR_VERSION
     network.producer_name = model.producer_name
     network.producer_version = model.producer_version
-    _replace(network.metadata_props, model.metadata_props)
+    replace_all(network.metadata_props, model.metadata_props)
     graph = network.graph
     graph.name = model.graph.name
     graph.ClearField("value_info")
@@ -361,15 +361,8 @@ def _tidy(network: ModelProto, model: ModelProto) -> None:
     reads.update(value.name for value in graph.output)
     constants = [tensor for tensor in graph.initializer if tensor.name in reads]
     # In the order of their names, so that the same file gives the same bytes.
-    _replace(graph.initializer, sorted(constants, key=lambda tensor: str(tensor.name)))
+    replace_all(graph.initializer, sorted(constants, key=lambda tensor: str(tensor.name)))
     name_counts = dict.fromkeys((node.name for node in graph.node), 0)
     for node in graph.node:
         if not node.name:
             node.name = free_name(node.output[0] or node.op_type, name_counts)
-
-
-def _replace(field: object, values: object) -> None:
-    """Replace the messages of a repeated field."""
-    messages = list(values)  # type: ignore[call-overload]
-    del field[:]  # type: ignore[attr-defined]
-    field.extend(messages)  # type: ignore[attr-defined]

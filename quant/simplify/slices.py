@@ -88,7 +88,7 @@ def unshuffle_slices(graph: OnnxGraph, node: Node) -> list[Node] | None:
 def _origin(graph: OnnxGraph, name: str) -> tuple[str, list[Node]]:
     """Return the tensor that slices in front of a name begin with, and these in their order."""
     slices: list[Node] = []
-    while (writer := graph.writers.get(name)) is not None and writer.op_type == "Slice":
+    while (writer := graph.writer(name)).op_type == "Slice":
         slices.insert(0, writer)
         name = writer.source
     return name, slices

@@ -50,7 +50,7 @@ def join_clips(graph: OnnxGraph, node: Node) -> list[Node] | None:
     unit = (high - low) / 6
 
     def constant(role: str, value: float) -> str:
-        return graph.add_constant(f"{result}.{role}", np.array(value))
+        return graph.add_constant(f"{result}.{role}", value)
 
     ends = [constant("zero", 0), constant("six", 6)]
     if (low, high) == (0, 6):
@@ -66,12 +66,12 @@ def join_clips(graph: OnnxGraph, node: Node) -> list[Node] | None:
     ]
 
 
-def joint_limits(graph: OnnxGraph, node: Node | None) -> tuple[str, float, float, int]:
+def joint_limits(graph: OnnxGraph, node: Node) -> tuple[str, float, float, int]:
     """Return what a node and those in front of it, which only clip, have in common.
 
     Args:
         graph: the graph that the node belongs to.
-        node: the last of the nodes; None returns no name and a count of 0.
+        node: the last of the nodes; another node returns no name and a count of 0.
 
     Returns:
         The tensor that is clipped, its low and its high limit, and the number of nodes.
@@ -80,7 +80,7 @@ def joint_limits(graph: OnnxGraph, node: Node | None) -> tuple[str, float, float
     high = np.inf
     source = ""
     count = 0
-    while node is not None and (step := _limits(graph, node)) is not None:
+    while step := _limits(graph, node):
         source, *limits = step
         low, high = (float(np.clip(limit, low, high)) for limit in limits)
         node = graph.sole_writer(source)
@@ -90,23 +90,20 @@ def joint_limits(graph: OnnxGraph, node: Node | None) -> tuple[str, float, float
 
 def _limits(graph: OnnxGraph, node: Node) -> tuple[str, float, float] | None:
     """Return the tensor that a node clips, and the low and the high limit; None for another."""
-    source = node.source
     if node.op_type == "Relu":
-        return source, 0.0, np.inf
+        return node.source, 0.0, np.inf
     if node.op_type == "Clip":
-        low, high = (
-            _scalar(graph, node, place) if any(node.inputs[place : place + 1]) else limit
-            for place, limit in ((1, -np.inf), (2, np.inf))
-        )
+        source, low_name, high_name = (*node.inputs, "", "")[:3]
+        low = _number(graph, low_name) if low_name else -np.inf
+        high = _number(graph, high_name) if high_name else np.inf
         if low is None or high is None:
             return None
         return source, low, high if high < UNLIMITED else np.inf
     if node.op_type in ("Max", "Min") and len(node.inputs) == 2:
-        for place in (0, 1):
-            limit = _scalar(graph, node, 1 - place)
-            if limit is not None:
-                ends = (limit, np.inf) if node.op_type == "Max" else (-np.inf, limit)
-                return (node.inputs[place], *ends)
+        for source, name in node.orders:
+            if (limit := _number(graph, name)) is not None:
+                is_low = node.op_type == "Max"
+                return source, limit if is_low else -np.inf, np.inf if is_low else limit
     return None
 
 
@@ -122,16 +119,14 @@ def join_hard_swish(graph: OnnxGraph, node: Node) -> list[Node] | None:
     Returns:
         The activation; None if the node completes none.
     """
-    sixth = other_operand(graph, node, "Mul", 1 / 6) or other_operand(graph, node, "Div", 6)
-    clipped = sixth or ""
-    shifted = _shifted_and_clipped(graph, clipped)
-    if shifted is not None:
+    name = node.result
+    clipped = other_operand(graph, name, "Mul", 1 / 6) or other_operand(graph, name, "Div", 6)
+    if shifted := _shifted_and_clipped(graph, clipped):
         return [node.replaced_by("HardSigmoid", [shifted], **SLOPE_AND_OFFSET)]
-    source = _gated_by(graph, node, _hard_sigmoid_of)
     product = graph.sole_writer(clipped)
-    if product is not None:
-        source = _gated_by(graph, product, _shifted_and_clipped)
-    return None if source is None else [node.replaced_by("HardSwish", [source])]
+    source = _gated_by(graph, product, _shifted_and_clipped)
+    source = source or _gated_by(graph, node, _hard_sigmoid_of)
+    return [node.replaced_by("HardSwish", [source])] if source else None
 
 
 def join_sigmoid(graph: OnnxGraph, node: Node) -> list[Node] | None:
@@ -147,11 +142,10 @@ def join_sigmoid(graph: OnnxGraph, node: Node) -> list[Node] | None:
     result = node.result
     source, affine = affine_chain(graph, result)
     tanh = graph.sole_writer(source)
-    is_half = (affine.scale == 0.5).all() and (affine.shift == 0.5).all()
-    if tanh is None or tanh.op_type != "Tanh" or not is_half:
+    if tanh.op_type != "Tanh" or {*affine.scale, *affine.shift} != {0.5}:
         return None
     doubled = f"{result}.doubled"
-    two = graph.add_constant(f"{result}.two", np.array(2.0))
+    two = graph.add_constant(f"{result}.two", 2)
     return [
         Node.new("Mul", [tanh.source, two], doubled),
         node.replaced_by("Sigmoid", [doubled]),
@@ -168,12 +162,10 @@ def halve_before_gelu(graph: OnnxGraph, node: Node) -> list[Node] | None:
     Returns:
         x / 2, and the product that completes the GELU; None if the node stays.
     """
-    for inner, outer in (node.inputs, node.inputs[::-1]) if node.op_type == "Mul" else ():
+    for inner, outer in node.orders if node.op_type == "Mul" else ():
         product = graph.sole_writer(inner)
-        if product is None or product.op_type != "Mul":
-            continue
         # Either the half is multiplied last, or the tensor itself.
-        for gate, other in (product.inputs, product.inputs[::-1]):
+        for gate, other in product.orders if product.op_type == "Mul" else ():
             source = gelu_gate_input(graph, gate)
             halves = {name for name in (other, outer) if _is_number(graph, name, 0.5)}
             if source and halves and {other, outer} == {source, *halves}:
@@ -185,105 +177,96 @@ def halve_before_gelu(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return None
 
 
-def gelu_gate_input(graph: OnnxGraph, name: str) -> str | None:
+def gelu_gate_input(graph: OnnxGraph, name: str) -> str:
     """Return the name of x if a tensor is the factor of x in a GELU, without its half: 1 + Erf(x /
-    sqrt(2)), or 1 + Tanh(sqrt(2 / pi) (x + 0.044715 x^3)); else None.
+    sqrt(2)), or 1 + Tanh(sqrt(2 / pi) (x + 0.044715 x^3)); else "".
 
     Args:
         graph: the graph that the tensor belongs to.
         name: the name of the tensor.
     """
-    function = graph.writers.get(other_operand(graph, graph.writers.get(name), "Add", 1) or "")
-    if function is None or function.op_type not in ("Erf", "Tanh"):
-        return None
-    scaled = graph.writers.get(function.source)
-    if function.op_type == "Tanh":
-        return _cubic_input(graph, scaled)
-    # Exporters divide by sqrt(2), or multiply by its reciprocal.
-    by_factor = other_operand(graph, scaled, "Mul", sqrt(0.5))
-    return by_factor or other_operand(graph, scaled, "Div", sqrt(2))
-
-
-def _cubic_input(graph: OnnxGraph, node: Node | None) -> str | None:
-    """Return x if a node computes sqrt(2 / pi) (x + 0.044715 x^3)."""
-    total = graph.writers.get(other_operand(graph, node, "Mul", sqrt(2 / pi)) or "")
-    if total is None or total.op_type != "Add":
-        return None
-    for source, scaled in (total.inputs, total.inputs[::-1]):
-        cube = graph.writers.get(
-            other_operand(graph, graph.writers.get(scaled), "Mul", 0.044715) or ""
-        )
-        if cube is not None and _gated_by(graph, cube, _squared) == source:
+    function = graph.writer(other_operand(graph, name, "Add", 1))
+    scaled = function.source
+    if function.op_type == "Erf":
+        # Exporters divide by sqrt(2), or multiply by its reciprocal.
+        by_factor = other_operand(graph, scaled, "Mul", sqrt(0.5))
+        return by_factor or other_operand(graph, scaled, "Div", sqrt(2))
+    total = graph.writer(other_operand(graph, scaled, "Mul", sqrt(2 / pi)))
+    is_cubic = function.op_type == "Tanh" and total.op_type == "Add"
+    for source, cubic in total.orders if is_cubic else ():
+        cube = graph.writer(other_operand(graph, cubic, "Mul", 0.044715))
+        if _gated_by(graph, cube, squared) == source:
             return source
-    return None
+    return ""
 
 
-def _gated_by(
-    graph: OnnxGraph, node: Node, gated: Callable[[OnnxGraph, str], str | None]
-) -> str | None:
-    """Return x if a node computes x times a function of x."""
-    if node.op_type != "Mul":
-        return None
-    pairs = node.inputs, node.inputs[::-1]
-    return next((source for source, gate in pairs if source == gated(graph, gate)), None)
+def _gated_by(graph: OnnxGraph, node: Node, gated: Callable[[OnnxGraph, str], str]) -> str:
+    """Return x if a node computes x times a function of x; else ""."""
+    pairs = node.orders if node.op_type == "Mul" else ()
+    return next((source for source, gate in pairs if source == gated(graph, gate)), "")
 
 
-def _squared(graph: OnnxGraph, name: str) -> str | None:
-    """Return x if a tensor is x times x."""
-    node = graph.writers.get(name)
-    is_square = node is not None and node.op_type == "Mul" and len(set(node.inputs)) == 1
-    return node.source if node is not None and is_square else None
-
-
-def _hard_sigmoid_of(graph: OnnxGraph, name: str) -> str | None:
-    """Return x if a tensor is HardSigmoid(x) of slope 1/6."""
-    node = graph.writers.get(name)
-    if node is None or node.op_type != "HardSigmoid":
-        return None
-    slope_and_offset = node.attributes.get("alpha", 0.2), node.attributes.get("beta", 0.5)
-    is_of_hard_swish = np.allclose(slope_and_offset, (1 / 6, 0.5), atol=1e-6)
-    return node.source if is_of_hard_swish else None
-
-
-def _shifted_and_clipped(graph: OnnxGraph, name: str) -> str | None:
-    """Return x if a tensor is x + 3, clipped from 0 to 6."""
-    clip = graph.writers.get(name)
-    if clip is None or clip.op_type != "Clip":
-        return None
-    shift = graph.writers.get(clip.source)
-    if (_scalar(graph, clip, 1), _scalar(graph, clip, 2)) != (0, 6) or shift is None:
-        return None
-    return other_operand(graph, shift, "Add", 3)
-
-
-def other_operand(graph: OnnxGraph, node: Node | None, kind: str, number: float) -> str | None:
-    """Return the name of the tensor that a node combines with a given constant number; None if it
-    does not.
+def squared(graph: OnnxGraph, name: str) -> str:
+    """Return the name of x if a tensor is x times x; else "".
 
     Args:
-        graph: the graph that the node belongs to.
-        node: any node; None returns None.
-        kind: the operator that the node must have, with two operands. The constant may be either of
-            them, but for Div it must be the divisor.
+        graph: the graph that the tensor belongs to.
+        name: the name of the tensor.
+    """
+    node = graph.writer(name)
+    return node.source if node.op_type == "Mul" and len({*node.inputs}) == 1 else ""
+
+
+def _hard_sigmoid_of(graph: OnnxGraph, name: str) -> str:
+    """Return x if a tensor is HardSigmoid(x) of slope 1/6; else ""."""
+    node = graph.writer(name)
+    return node.source if node.op_type == "HardSigmoid" and has_slope_of_dpu(node) else ""
+
+
+def has_slope_of_dpu(node: Node) -> bool:
+    """Return True if a HardSigmoid has the slope 1/6 and the offset 0.5, as a DPU computes it."""
+    return np.allclose(slope_and_offset(node), (1 / 6, 0.5), 1e-4)
+
+
+def slope_and_offset(node: Node) -> tuple[float, float]:
+    """Return the slope and the offset of a HardSigmoid, with ONNX's defaults filled in."""
+    return node.attributes.get("alpha", 0.2), node.attributes.get("beta", 0.5)
+
+
+def _shifted_and_clipped(graph: OnnxGraph, name: str) -> str:
+    """Return x if a tensor is x + 3, clipped from 0 to 6; else ""."""
+    source, *limits, _ = joint_limits(graph, graph.writer(name))
+    return other_operand(graph, source, "Add", 3) if limits == [0, 6] else ""
+
+
+def other_operand(graph: OnnxGraph, name: str, kind: str, number: float) -> str:
+    """Return the name of the tensor that is combined with a constant number to another one; "" if
+    that is computed in another way.
+
+    Args:
+        graph: the graph that the tensors belong to.
+        name: the name of the result.
+        kind: the operator that writes it, with two operands. The constant may be either of them,
+            but for Div it must be the divisor.
         number: the constant, which is compared up to the rounding of float32.
     """
-    if node is not None and node.op_type == kind and len(node.inputs) == 2:
-        for place in (0, 1)[: 1 if kind == "Div" else 2]:
-            if _is_number(graph, node.inputs[1 - place], number):
-                return node.inputs[place]
-    return None
+    node = graph.writer(name)
+    orders = node.orders if node.op_type == kind and len(node.inputs) == 2 else ()
+    for source, constant in orders[:1] if kind == "Div" else orders:
+        if _is_number(graph, constant, number):
+            return source
+    return ""
 
 
 def _is_number(graph: OnnxGraph, name: str, number: float) -> bool:
     """Return True if a tensor is a constant of this one number, up to the rounding of float32."""
+    value = _number(graph, name)
+    return value is not None and bool(np.isclose(value, number, rtol=1e-6, atol=0))
+
+
+def _number(graph: OnnxGraph, name: str) -> float | None:
+    """Return the value of a constant of one float; None for any other tensor."""
     value = graph.constants.get(name)
     if value is None or value.size != 1 or value.dtype.kind != "f":
-        return False
-    return bool(np.isclose(value.item(), number, rtol=1e-6, atol=0))
-
-
-def _scalar(graph: OnnxGraph, node: Node, place: int) -> float | None:
-    """Return a constant float of one number that a node reads; None if it reads none there."""
-    value = graph.value(node, place)
-    is_number = value is not None and value.size == 1 and value.dtype.kind == "f"
-    return float(value.item()) if is_number and value is not None else None
+        return None
+    return float(value.item())

@@ -3,21 +3,8 @@
 import numpy as np
 from onnx import TensorProto
 
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
+from beers_deploy.quant.onnx.graph import NO_NODE, Node, OnnxGraph
 from beers_deploy.quant.onnx.resize import PLACES, ROUNDINGS, Resizing
-
-
-def float_shapes(graph: OnnxGraph) -> dict[str, tuple[int, ...]]:
-    """Infer the sizes of each float32 tensor of a graph.
-
-    Returns:
-        The sizes by tensor name, 0 for an unknown size. Tensors of unknown rank are left out.
-    """
-    return {
-        name: sizes_of(tensor)
-        for name, tensor in graph.tensor_types().items()
-        if tensor.elem_type == TensorProto.FLOAT and tensor.HasField("shape")
-    }
 
 
 def split_sums(_: OnnxGraph, node: Node) -> list[Node] | None:
@@ -31,16 +18,13 @@ def split_sums(_: OnnxGraph, node: Node) -> list[Node] | None:
     """
     if node.op_type != "Sum" or len(node.inputs) < 2:
         return None
+    *others, last = node.inputs[1:]
     subtotal = node.source
-    (output,) = node.outputs
     adds = []
-    for number, name in enumerate(node.inputs[1:], 1):
-        is_last = number == len(node.inputs) - 1
-        result = output if is_last else f"{output}.{number}"
-        own_name = node.proto.name if is_last else result
-        adds.append(Node.new("Add", [subtotal, name], result, own_name))
-        subtotal = result
-    return adds
+    for number, name in enumerate(others, 1):
+        adds.append(Node.new("Add", [subtotal, name], f"{node.result}.{number}"))
+        subtotal = adds[-1].result
+    return [*adds, Node.new("Add", [subtotal, last], node.result, node.proto.name)]
 
 
 def split_soft_threshold(graph: OnnxGraph, node: Node) -> list[Node] | None:
@@ -54,17 +38,15 @@ def split_soft_threshold(graph: OnnxGraph, node: Node) -> list[Node] | None:
     Returns:
         The nodes that replace the product; None if it is something else.
     """
-    before = [graph.writers.get(name) for name in node.inputs] if node.op_type == "Mul" else []
-    by_type = {writer.op_type: writer for writer in before if writer is not None}
-    if by_type.keys() != {"Relu", "Sign"}:
+    before = {writer.op_type: writer for writer in map(graph.writer, node.inputs)}
+    if node.op_type != "Mul" or before.keys() != {"Relu", "Sign"}:
         return None
-    difference = graph.writers.get(by_type["Relu"].source)
-    threshold = graph.value(difference, 1) if difference is not None else None
-    if difference is None or difference.op_type != "Sub" or threshold is None:
-        return None
-    source = by_type["Sign"].source
-    size = graph.writers.get(difference.source)
-    if size is None or (size.op_type, size.source) != ("Abs", source) or (threshold < 0).any():
+    source = before["Sign"].source
+    difference = graph.writer(before["Relu"].source)
+    threshold = graph.value(difference, 1)
+    size = graph.writer(difference.source)
+    is_of_size = (difference.op_type, size.op_type, size.source) == ("Sub", "Abs", source)
+    if not is_of_size or threshold is None or (threshold < 0).any():
         return None
     parts = [f"{node.result}.{part}" for part in ("negative", "above", "below", "more", "less")]
     negative, above, below, more, less = parts
@@ -91,7 +73,7 @@ def choose_by_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """
     if node.op_type not in ("Abs", "Max", "Min"):
         return None
-    (result,) = node.outputs
+    result = node.result
     rest = f"{result}.difference"
     limited = f"{result}.relu"
     relu = Node.new("Relu", [rest], limited)
@@ -148,9 +130,9 @@ def divide_by_reciprocal(graph: OnnxGraph, node: Node) -> list[Node] | None:
     Returns:
         The quotient; None if the node is something else.
     """
-    for source, factor in zip(node.inputs, node.inputs[::-1], strict=True):
-        before = graph.writers.get(factor)
-        if node.op_type == "Mul" and before is not None and before.op_type == "Reciprocal":
+    for source, factor in node.orders if node.op_type == "Mul" else ():
+        before = graph.writer(factor)
+        if before.op_type == "Reciprocal":
             return [node.replaced_by("Div", [source, before.source])]
     return None
 
@@ -172,7 +154,7 @@ def drop_where(graph: OnnxGraph, node: Node) -> list[Node] | None:
     result = node.result
     # A smaller map would have been repeated.
     is_of_size = source in graph.shapes and graph.shapes[source] == graph.shapes.get(result)
-    if graph.sole_writer(source) is None or not is_of_size:
+    if graph.sole_writer(source) is NO_NODE or not is_of_size:
         return None
     graph.rename(source, result)
     return []
@@ -192,7 +174,7 @@ def drop_cast_or_reshape(graph: OnnxGraph, node: Node) -> list[Node] | None:
         An empty list if the node is removed; None if it stays.
     """
     size = graph.shapes.get(node.source)
-    if size is None or graph.sole_writer(node.source) is None:
+    if size is None or graph.sole_writer(node.source) is NO_NODE:
         return None
     is_cast = node.op_type == "Cast" and node.attributes["to"] == TensorProto.FLOAT
     if not is_cast and not (node.op_type == "Reshape" and _keeps_sides(graph, node, size)):
@@ -210,6 +192,18 @@ def _keeps_sides(graph: OnnxGraph, node: Node, sides: tuple[int, ...]) -> bool:
     return len(stated) == len(sides) and all(is_kept) and not node.attributes.get("allowzero", 0)
 
 
+def reduced_axes(graph: OnnxGraph, node: Node) -> set[int]:
+    """Return the axes, from 0 to 3, over which a node computes a sum, mean or maximum; an empty set
+    if it states none.
+
+    Args:
+        graph: the graph that the node belongs to.
+        node: the node.
+    """
+    # From opset 18 on the axes are an input.
+    return {axis % 4 for axis in graph.numbers(node, 1, "axes") or ()}
+
+
 def pool_mean(graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a mean over rows and columns by GlobalAveragePool, and a Flatten if both axes are
     dropped, and a sum or mean over channels by a convolution of one pixel.
@@ -221,11 +215,13 @@ def pool_mean(graph: OnnxGraph, node: Node) -> list[Node] | None:
     Returns:
         The nodes that replace the mean; None if the node is something else.
     """
-    size = graph.shapes.get(node.source, ()) if node.op_type in ("ReduceMean", "ReduceSum") else ()
-    # From opset 18 on the axes are an input.
-    axes = {axis % 4 for axis in graph.numbers(node, 1, "axes") or ()} if size else set()
-    (output, *_) = node.outputs
-    if axes == {1} and len(size) == 4 and size[1] and node.attributes.get("keepdims", 1):
+    size = graph.shapes.get(node.source, ())
+    if node.op_type not in ("ReduceMean", "ReduceSum") or len(size) != 4:
+        return None
+    axes = reduced_axes(graph, node)
+    output = node.result
+    keeps_axes = node.attributes.get("keepdims", 1)
+    if axes == {1} and size[1] and keeps_axes:
         # A layer normalisation, which has a root, is refused by its mean.
         if any(other.op_type == "Sqrt" for other in graph.nodes):
             return None
@@ -233,9 +229,9 @@ def pool_mean(graph: OnnxGraph, node: Node) -> list[Node] | None:
         if node.op_type == "ReduceMean":
             weight /= size[1]
         return [graph.convolution(node.source, output, node.name, weight)]
-    if len(size) != 4 or axes != {2, 3} or node.op_type != "ReduceMean":
+    if axes != {2, 3} or node.op_type != "ReduceMean":
         return None
-    if node.attributes.get("keepdims", 1):
+    if keeps_axes:
         return [Node.new("GlobalAveragePool", node.inputs[:1], output, node.proto.name)]
     pooled = f"{output}.pooled"
     graph.shapes[pooled] = (*size[:2], 1, 1)
@@ -258,13 +254,11 @@ def pool_sums(graph: OnnxGraph, node: Node) -> list[Node] | None:
     divisor = graph.value(node, 1) if node.op_type == "Div" else None
     axes: set[int] = set()
     name = node.source
-    total = graph.writers.get(name)
-    while total is not None and total.op_type == "ReduceSum":
+    while (total := graph.writer(name)).op_type == "ReduceSum":
         if not total.attributes.get("keepdims", 1):
             return None
-        axes.update(axis % 4 for axis in graph.numbers(total, 1, "axes") or ())
+        axes |= reduced_axes(graph, total)
         name = total.source
-        total = graph.writers.get(name)
     size = graph.shapes.get(name, ())
     if axes != {2, 3} or len(size) != 4 or divisor is None or (divisor != size[2] * size[3]).any():
         return None
@@ -286,8 +280,7 @@ def pool_maximum(graph: OnnxGraph, node: Node) -> list[Node] | None:
         return None
     source = node.source
     size = graph.shapes.get(source, ())
-    # From opset 18 on the axes are an input.
-    axes = {axis % 4 for axis in graph.numbers(node, 1, "axes") or ()}
+    axes = reduced_axes(graph, node)
     result = node.result
     if len(size) != 4 or not node.attributes.get("keepdims", 1):
         return None

@@ -30,8 +30,9 @@ from onnx import ModelProto, TypeProto
 
 from beers_deploy.profiles.errors import ModelError, counted
 from beers_deploy.quant.graph.pixel_shuffle import MOVES, with_shuffles
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.image_input import fixed_tile_px
+from beers_deploy.quant.onnx.messages import sizes_of
 from beers_deploy.quant.onnx_file import faults_named
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.tiling.axis_maps import AXIS_MAPS, AxisMap, AxisNode, not_tileable

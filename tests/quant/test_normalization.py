@@ -13,7 +13,6 @@ from beers_deploy.quant.graph.normalization import InverseDeviation, Normalizati
 from beers_deploy.quant.onnx.graph import OnnxGraph
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.simplify import simplify
-from beers_deploy.quant.simplify.standard_operators import float_shapes
 from beers_deploy.quant.structure import structure_checks
 from tests.quant.adapt.images import HELD_OUT, SAMPLES, assert_near, squared_error
 from tests.quant.quick import changed, quickly
@@ -155,7 +154,7 @@ def test_only_the_deviation_is_approximated(
     image = level + contrast * np.random.default_rng(seed).normal(size=(1, 1, PX, PX))
     image = image.astype(np.float32)
     graph = OnnxGraph(model)
-    graph.shapes = float_shapes(graph)
+    graph.infer_shapes()
     (normalization,) = (each for node in graph.nodes if (each := Normalization.of(graph, node)))
     assert normalization.is_of_pixels == (spelling in OF_PIXELS)
     if normalization.is_of_pixels:

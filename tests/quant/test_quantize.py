@@ -8,7 +8,7 @@ from beers_deploy.quant.core import build_core, shift_faults
 from beers_deploy.quant.encodings import board_model
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import PLANES, Graph
-from beers_deploy.quant.onnx.graph import constants
+from beers_deploy.quant.onnx.messages import constants
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.samples.patches import Patches

@@ -16,7 +16,7 @@ from beers_deploy.quant.core import build_core
 from beers_deploy.quant.encodings import host_model, vint8_model
 from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, Activation, Graph, Window
 from beers_deploy.quant.integer.reference import merged_correction, run_core
-from beers_deploy.quant.onnx.graph import constants
+from beers_deploy.quant.onnx.messages import constants
 from beers_deploy.quant.session import open_session, planes_of, run
 from tests.quant.quick import uniform
 

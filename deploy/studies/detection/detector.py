@@ -28,8 +28,8 @@ from beers_deploy.profiles.errors import (
     printable,
     reason_of,
 )
-from beers_deploy.quant.onnx.graph import constants
 from beers_deploy.quant.onnx.image_input import fixed_tile_px
+from beers_deploy.quant.onnx.messages import constants
 from beers_deploy.quant.onnx_file import load_onnx, metadata
 from beers_deploy.quant.session import open_session
 from beers_deploy.studies.detection.boxes import MAX_BOXES, Boxes, Letterbox, suppress
