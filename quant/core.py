@@ -290,14 +290,21 @@ def _quantize_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts) -> IntCo
     frac_bits[op.output] = product - cut
     weight = quantize(op.weight, weight_frac_bits)
     bias, bias_frac_bits = quantize_bias(op.bias, product, shifts)
-    activation = op.activation
     # ReLU6 equals ReLU if int8 ends at six or below, as it does once `equalize` has scaled.
     ends_first = op.ceiling is not None or INT8_MAX * 2.0 ** -frac_bits[op.output] <= SIX
-    if activation is Activation.relu6 and ends_first:
-        activation = Activation.relu
-    kind = (activation, op.window, op.groups, op.transposed)
+    is_relu = op.activation is Activation.relu6 and ends_first
     return IntConv(
-        op.name, op.input, op.output, weight, weight_frac_bits, bias, bias_frac_bits, *kind
+        op.name,
+        op.input,
+        op.output,
+        weight,
+        weight_frac_bits,
+        bias,
+        bias_frac_bits,
+        Activation.relu if is_relu else op.activation,
+        op.window,
+        op.groups,
+        op.transposed,
     )
 
 

@@ -27,7 +27,7 @@ from onnx import ModelProto, TensorProto
 
 from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.domains import opset_of
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Replacement
 
 INT16 = np.iinfo(np.int16)
 MIDDLE = 128
@@ -117,7 +117,7 @@ def _set_input(node: Node, place: int, name: str) -> None:
     node.inputs = tuple(inputs)
 
 
-def _move_relu_down(largest: dict[str, int], graph: OnnxGraph, node: Node) -> list[Node] | None:
+def _move_relu_down(largest: dict[str, int], graph: OnnxGraph, node: Node) -> Replacement:
     """Store the result of a ReLU, max(result, its zero point), around 0: the result is moved
     down, and the ReLU becomes a Min.
 
@@ -161,7 +161,7 @@ def _holds(graph: OnnxGraph, node: Node, place: int, value: np.ndarray) -> bool:
     return constant is not None and np.array_equal(constant.ravel(), value.ravel())
 
 
-def _add_exactly(largest: dict[str, int], graph: OnnxGraph, node: Node) -> list[Node] | None:
+def _add_exactly(largest: dict[str, int], graph: OnnxGraph, node: Node) -> Replacement:
     """Return the node computed in an exact way, with the conversions before and behind it.
 
     Args:
@@ -205,7 +205,7 @@ def _add_exactly(largest: dict[str, int], graph: OnnxGraph, node: Node) -> list[
     return nodes
 
 
-def _add_dequantised(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def _add_dequantised(graph: OnnxGraph, node: Node) -> Replacement:
     """Return a float operator on dequantised weights, after the node that dequantises uint8
     ones.
     """
@@ -213,7 +213,7 @@ def _add_dequantised(graph: OnnxGraph, node: Node) -> list[Node] | None:
     weight = graph.value(source, 0)
     if source.op_type != "DequantizeLinear" or weight is None or weight.dtype != np.int8:
         return None
-    weight = weight.T if node.attributes.get("transB") else weight
+    weight = weight.T if node.attribute("transB") else weight
     if cannot_saturate(FLOAT_OPERATORS[node.op_type], weight, UINT8_MAX):
         return None
     # A copy, because another node may read the same weights as int8.
@@ -272,7 +272,7 @@ def with_wide_convolutions(model: ModelProto) -> ModelProto:
     return wide
 
 
-def _widen(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def _widen(graph: OnnxGraph, node: Node) -> Replacement:
     """Return a convolution with channels of zeros, and the nodes that widen its input and narrow
     its output.
     """

@@ -167,10 +167,7 @@ def _rounded(graph: OnnxGraph, core: IntCore | None) -> list[Rounded]:
     read_as = {
         node.result: node.source for node in graph.nodes if node.op_type == "DequantizeLinear"
     }
-    relus = set[str]()
-    for node in graph.nodes:
-        if node.op_type in RELUS:
-            relus.update(node.inputs)
+    relus = set(chain.from_iterable(n.inputs for n in graph.nodes if n.op_type in RELUS))
     # In a QDQ file the ReLU reads the tensor as float, behind its DequantizeLinear.
     relus |= {read_as[name] for name in relus & set(read_as)}
     tensors = []
@@ -240,16 +237,19 @@ def count_relus(model: ModelProto) -> Relus:
             if isinstance(op, Pointwise) and op.activation in HARD
         }
         nodes = [node for node in graph.nodes if alike.isdisjoint(node.outputs)]
-        convolutions = [node for node in graph.nodes if "Conv" in node.op_type]
-        convolved = set(chain.from_iterable(node.outputs for node in convolutions))
+        convolved = {node.result for node in graph.nodes if "Conv" in node.op_type}
         explicit = sum(_is_relu(graph, node, tensors) for node in nodes)
-        folded = 0
-        for node in graph.nodes:
-            value = tensors.get(node.result)
-            is_convolved = node.op_type == "QLinearConv" or convolved.intersection(node.inputs[:1])
-            # All numbers of a convolution's result are at least zero.
-            if value is not None and is_convolved:
-                folded += set(value.scale.zero_points) == {value.lowest}
+        results = {
+            node.result
+            for node in graph.nodes
+            if node.op_type == "QLinearConv" or node.source in convolved
+        }
+        # All numbers of a convolution's result are at least zero.
+        folded = sum(
+            set(tensor.scale.zero_points) == {tensor.lowest}
+            for name, tensor in tensors.items()
+            if name in results
+        )
         return Relus(explicit, folded)
 
 
@@ -321,9 +321,8 @@ def structure_checks(
         kinds = Counter(node.op_type for node in float_model.graph.node)
         replaced = nodes_by_kind(OnnxGraph(float_model))
         float_relus += kinds["LeakyRelu"] + kinds["PRelu"]
-        float_relus += len(replaced.get(Kind.tanh, ()))
-        float_relus += len(replaced.get(Kind.deviation, ()))
-        float_relus += 2 * len(replaced.get(Kind.normalization, ()))
+        for kind, count in {Kind.tanh: 1, Kind.deviation: 1, Kind.normalization: 2}.items():
+            float_relus += count * len(replaced.get(kind, ()))
         float_relus -= sum(
             isinstance(op, IntConv | Pointwise) and op.activation is Activation.leaky_relu
             for op in core.ops

@@ -65,7 +65,7 @@ class Networks:
 
         It must have constant weights and stated pads, and must not be transposed.
         """
-        is_plain = node.attributes.get("auto_pad", "NOTSET") == "NOTSET"
+        is_plain = node.attribute("auto_pad", "NOTSET") == "NOTSET"
         return node.op_type == "Conv" and is_plain and is_convolution(self.graph, node)
 
     def weights(self, node: Node) -> tuple[np.ndarray, np.ndarray]:

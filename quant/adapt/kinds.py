@@ -158,7 +158,7 @@ def slopes_of(graph: OnnxGraph, node: Node) -> np.ndarray | None:
         per channel.
     """
     if node.op_type == "LeakyRelu":
-        return np.array([node.attributes.get("alpha", 0.01)], np.float32)
+        return np.array([node.attribute("alpha", 0.01)], np.float32)
     return per_channel(graph.value(node, 1)) if node.op_type == "PRelu" else None
 
 

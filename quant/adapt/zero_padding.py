@@ -9,7 +9,7 @@ import numpy as np
 import onnx
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Replacement
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 
 MIRRORED_PX = 16
@@ -24,7 +24,7 @@ def pads_of(graph: OnnxGraph, node: Node) -> tuple[int, ...]:
         graph: the graph that the node belongs to.
         node: any node.
     """
-    if node.op_type != "Pad" or node.attributes.get("mode") not in ("edge", "reflect"):
+    if node.op_type != "Pad" or node.attribute("mode") not in ("edge", "reflect"):
         return ()
     readers = {reader.op_type for reader in graph.readers[node.result]}
     amounts = graph.numbers(node, 1, "pads") or []
@@ -74,12 +74,12 @@ def pad_by_zeros(model: onnx.ModelProto) -> None:
     graph.save()
 
 
-def _padded(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def _padded(graph: OnnxGraph, node: Node) -> Replacement:
     """Return a convolution that pads by zeros what the Pad in front of it adds; None for others."""
     pad = graph.writer(node.source)
     pads = pads_of(graph, pad) if node.op_type == "Conv" else ()
     if not pads:
         return None
-    own = node.attributes.get("pads", [0] * 4)
+    own = node.attribute("pads", [0] * 4)
     attributes = {**node.attributes, "pads": [sum(both) for both in zip(own, pads, strict=True)]}
     return [node.replaced_by("Conv", [pad.source, *node.inputs[1:]], **attributes)]

@@ -43,10 +43,10 @@ def shrinking(graph: OnnxGraph, node: Node) -> list[Node]:
         (writer.op_type, pool.op_type) == ("Conv", "MaxPool")
         and weight is not None
         and weight.shape[2:] == (3, 3)
-        and writer.attributes.get("strides") == [2, 2]
-        and pool.attributes.get("kernel_shape") == [7, 7]
-        and pool.attributes.get("strides") == [3, 3]
-        and not any([*writer.attributes.get("pads", []), *pool.attributes.get("pads", [])])
+        and writer.attribute("strides") == [2, 2]
+        and pool.attribute("kernel_shape") == [7, 7]
+        and pool.attribute("strides") == [3, 3]
+        and not any([*writer.attribute("pads", []), *pool.attribute("pads", [])])
         and Resizing.of(graph, node).mode == "linear"
     )
     return [writer, pool, *nodes] if is_attention else []

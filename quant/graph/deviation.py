@@ -153,7 +153,7 @@ def _axes_of_mean(graph: OnnxGraph, node: Node) -> set[int]:
     """
     if node.op_type == "GlobalAveragePool":
         return OVER_IMAGE
-    is_kept = node.op_type == "ReduceMean" and node.attributes.get("keepdims", 1)
+    is_kept = node.op_type == "ReduceMean" and node.attribute("keepdims", 1)
     axes = reduced_axes(graph, node) if is_kept else set()
     return axes if axes == OVER_CHANNELS else set()
 

@@ -66,7 +66,12 @@ def host_end(graph: OnnxGraph) -> HostEnd:
     (result, *_) = graph.outputs
     replaced: dict[str, str] = {}
     # 1.
-    crop_px = _crop_px(graph, result)
+    last = graph.sole_writer(result)
+    cuts = slices_of(graph, last) if last.op_type == "Slice" else {}
+    crop_px = cuts[2].start if 2 in cuts else 0
+    both_sides = slice(crop_px, -crop_px, 1)
+    if cuts != {2: both_sides, 3: both_sides}:
+        crop_px = 0
     if crop_px:
         replaced[result] = graph.writer(result).source
         result = replaced[result]
@@ -89,15 +94,6 @@ def host_end(graph: OnnxGraph) -> HostEnd:
     replaced[activation.result] = activation.source
     is_last = base is not None or not adds_image
     return HostEnd(replaced, crop_px, limits, base, activation.op_type, is_last)
-
-
-def _crop_px(graph: OnnxGraph, result: str) -> int:
-    """Return the pixels that a Slice cuts off at each side of a tensor; 0 for another node."""
-    node = graph.sole_writer(result)
-    cuts = slices_of(graph, node) if node.op_type == "Slice" else {}
-    crop_px = cuts[2].start if 2 in cuts else 0
-    both_sides = slice(crop_px, -crop_px, 1)
-    return crop_px if cuts == {2: both_sides, 3: both_sides} else 0
 
 
 def _limits(graph: OnnxGraph, result: str, limits: tuple[float, ...]) -> tuple[float, ...]:

@@ -24,6 +24,6 @@ def image_mirror(graph: OnnxGraph) -> tuple[Node, int] | None:
     amounts = graph.numbers(pad, 1, "pads") or [0]
     border_px = int(amounts[-1])
     is_even = amounts == [0, 0, border_px, border_px] * 2
-    if pad.attributes.get("mode") != "reflect" or not is_even or border_px < 1:
+    if pad.attribute("mode") != "reflect" or not is_even or border_px < 1:
         return None
     return pad, border_px

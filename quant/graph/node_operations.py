@@ -93,7 +93,7 @@ def _read_conv(graph: OnnxGraph, node: Node) -> Op:
 
 def _check_transposed(node: Node) -> None:
     """Raise ModelError unless a transposed convolution enlarges rows and columns by one factor."""
-    attribute = node.attributes.get
+    attribute = node.attribute
     strides = list(attribute("strides", [1, 1]))
     rule = f"must have one stride for rows and columns, got strides {strides}"
     require(len(set(strides)) == 1, node, rule, "Use a square stride.")
@@ -115,31 +115,31 @@ def _window(node: Node, kernel: Sequence[int] = ()) -> tuple[Pair, Window]:
     kernel_and_window = node.window(kernel)
     if kernel_and_window is None:
         raise unsupported(f"{node} must have a window over rows and columns.")
-    rule = f"must state its pads instead of auto_pad {node.attributes.get('auto_pad')} with strides"
+    rule = f"must state its pads instead of auto_pad {node.attribute('auto_pad')} with strides"
     require(not leaves_pads(node), node, rule)
     return kernel_and_window
 
 
 def _read_concat(graph: OnnxGraph, node: Node) -> Op:
-    axis = node.attributes.get("axis")
+    axis = node.attribute("axis")
     require(axis in (1, -3), node, f"must concatenate along the channels, got axis {axis}")
     computed = graph.constants.keys().isdisjoint(node.inputs)
     require(computed, node, "must concatenate computed tensors, got a constant")
     return Concat(node.name, node.inputs, node.result)
 
 
-def _read_max_pool(_: OnnxGraph, node: Node) -> Op:
-    plain = len(node.outputs) == 1 and not node.attributes.get("ceil_mode", 0)
-    require(plain, node, "must have one output and ceil_mode 0")
-    return MaxPool(node.name, node.source, node.result, *_window(node))
-
-
-def _read_average_pool(_: OnnxGraph, node: Node) -> Op:
+def _read_pool(_: OnnxGraph, node: Node) -> Op:
     kernel, window = _window(node)
-    zeros = bool(node.attributes.get("count_include_pad", 0)) or not any(window.pads)
-    plain = zeros and not node.attributes.get("ceil_mode", 0)
-    require(plain, node, "must have count_include_pad 1 and ceil_mode 0")
-    return AveragePool(node.name, node.source, node.result, kernel, window)
+    kind: type[MaxPool | AveragePool] = MaxPool
+    rule = "one output"
+    is_plain = len(node.outputs) == 1
+    if node.op_type == "AveragePool":
+        kind = AveragePool
+        rule = "count_include_pad 1"
+        is_plain = bool(node.attribute("count_include_pad")) or not any(window.pads)
+    is_plain = is_plain and not node.attribute("ceil_mode")
+    require(is_plain, node, f"must have {rule} and ceil_mode 0")
+    return kind(node.name, node.source, node.result, kernel, window)
 
 
 def _read_resize(graph: OnnxGraph, node: Node) -> Op:
@@ -177,7 +177,7 @@ def _read_resize(graph: OnnxGraph, node: Node) -> Op:
 
 def _read_shuffle(_: OnnxGraph, node: Node) -> Op:
     """Read a pixel shuffle; Reshape and Transpose that make one are one already."""
-    mode = node.attributes.get("mode", "DCR") if node.op_type not in MOVES else ""
+    mode = node.attribute("mode", "DCR") if node.op_type not in MOVES else ""
     require(
         mode in ORDERS,
         node,
@@ -191,16 +191,12 @@ def _read_shuffle(_: OnnxGraph, node: Node) -> Op:
 
 
 READERS: dict[str, Callable[[OnnxGraph, Node], Op]] = {
-    "AveragePool": _read_average_pool,
+    **dict.fromkeys(("AveragePool", "MaxPool"), _read_pool),
     "Concat": _read_concat,
-    "Conv": _read_conv,
-    "ConvTranspose": _read_conv,
-    "DepthToSpace": _read_shuffle,
+    **dict.fromkeys(("Conv", "ConvTranspose"), _read_conv),
     "GlobalAveragePool": lambda _, node: AveragePool(node.name, node.source, node.result, None),
-    "MaxPool": _read_max_pool,
     "Resize": _read_resize,
-    "SpaceToDepth": _read_shuffle,
-    **dict.fromkeys(MOVES, _read_shuffle),
+    **dict.fromkeys(("DepthToSpace", "SpaceToDepth", *MOVES), _read_shuffle),
 }
 """Operators that are one operation, independent of the nodes before them."""
 
@@ -225,7 +221,7 @@ def read_activation(graph: OnnxGraph, node: Node) -> Activation:
     """
     activation = ACTIVATIONS[node.op_type]
     if node.op_type == "LeakyRelu":
-        slope = float(node.attributes.get("alpha", 0.01))
+        slope = float(node.attribute("alpha", 0.01))
         require(
             slope == np.float32(LEAKY_SLOPE),
             node,

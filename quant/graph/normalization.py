@@ -95,7 +95,7 @@ class Normalization:
         is_of_kind = node.op_type == "InstanceNormalization" and is_square
         if not is_of_kind or scale is None or shift is None:
             return None
-        epsilon = float(node.attributes.get("epsilon", 1e-5))
+        epsilon = float(node.attribute("epsilon", 1e-5))
         return cls(node, node.source, False, size[2], len(scale), scale, shift, epsilon)
 
     @classmethod

@@ -79,7 +79,7 @@ def stated(graph: OnnxGraph, node: Node) -> Iterator[tuple[str, Scale]]:
         # A missing zero point is 0. Its type is that of the constant, that of `output_dtype`, or
         # ONNX's default, which is uint8.
         if zeros is None:
-            output_dtype = node.attributes.get("output_dtype") or TensorProto.UINT8
+            output_dtype = node.attribute("output_dtype") or TensorProto.UINT8
             dtype = helper.tensor_dtype_to_np_dtype(output_dtype)
             if name in graph.constants:
                 dtype = graph.constants[name].dtype
@@ -263,7 +263,7 @@ class Integers:
         source = node.source
         result = node.result
         if node.op_type == "Cast":
-            writes_int8 = node.attributes.get("to") in BYTES
+            writes_int8 = node.attribute("to") in BYTES
         else:
             rounds = node.op_type in FORMATS or node.op_type == "QLinearConcat"
             writes_int8 = rounds or self._reads(node, self._int8)

@@ -137,7 +137,13 @@ class _Reader:
         self.source = with_shuffles(self._adapted(model))
         self.image, *_ = self.source.inputs
         self.ops: list[Op] = []
-        self.border_px = self._take_mirror()
+        self.border_px = 0
+        # The host mirrors the image.
+        if mirror := image_mirror(self.source):
+            pad, self.border_px = mirror
+            for node in self.source.readers[pad.result]:
+                node.read_instead(pad.result, self.image)
+            self.source.set_nodes([node for node in self.source.nodes if node is not pad])
         self.end = host_end(self.source)
 
     def _adapted(self, model: ModelProto) -> ModelProto:
@@ -165,20 +171,6 @@ class _Reader:
         self.adaptable = AdaptableError(str(unsupported(fault, ADAPT)))
         return network
 
-    def _take_mirror(self) -> int:
-        """Remove a Pad that mirrors the image, and return its border in pixels; the host does the
-        padding.
-        """
-        source = self.source
-        mirror = image_mirror(source)
-        if mirror is None:
-            return 0
-        pad, border_px = mirror
-        for node in source.readers[pad.result]:
-            node.read_instead(pad.result, self.image)
-        source.set_nodes([node for node in source.nodes if node is not pad])
-        return border_px
-
     def channels(self) -> int:
         """Return the channels of the image."""
         sizes = self.source.inputs[self.image]
@@ -202,7 +194,10 @@ class _Reader:
                 self._read(node)
             except AdaptableError as error:
                 self.adaptable = self.adaptable or error
-                self.ops.append(_stand_in(self.source, node))
+                # An enlargement stands in, so that the rest is read: by the same factor, or by 1.
+                is_resize = node.op_type == "Resize"
+                factor = Resizing.of(self.source, node).factors[2] if is_resize else 1
+                self.ops.append(Resize(node.name, node.source, node.result, int(factor), True))
         if not self.ops or self.ops[-1].output != result:
             raise unsupported("No operation writes the network's output.")
         graph = named_apart(self.ops, {self.image: IMAGE, result: CORRECTION})
@@ -250,22 +245,26 @@ class _Reader:
 
     def _arithmetic(self, node: Node) -> None:
         """Append a sum, difference or product of two tensors, or of one with constants."""
-        if any(self.source.value(node, place) is not None for place in (0, 1)):
-            self.ops.append(self._by_constant(node))
+        constants = self.source.constants
+        shapes = [constants[name].shape for name in node.inputs if name in constants]
+        if shapes:
+            self.ops.append(self._by_constant(node, shapes[0]))
             return
-        inputs = node.source, node.inputs[1]
         require(node.op_type != "Div", node, "must divide by a constant, not by a computed tensor")
         # Simplification has made an Add of a Sub whose channels are known.
         require(node.op_type != "Sub", node, "subtracts a map of unknown channels")
         kind = Mul if node.op_type == "Mul" else Add
-        self.ops.append(kind(node.name, inputs, node.result))
+        self.ops.append(kind(node.name, node.inputs, node.result))
 
-    def _by_constant(self, node: Node) -> Op:
-        """Read arithmetic with one number a channel as a depthwise convolution of one pixel."""
+    def _by_constant(self, node: Node, shape: tuple[int, ...]) -> Op:
+        """Read arithmetic with one number a channel as a depthwise convolution of one pixel.
+
+        Args:
+            node: the arithmetic.
+            shape: the shape of its constant.
+        """
         match = affine_of(self.source, node)
         if match is None:
-            shapes = (self.source.value(node, place) for place in (0, 1))
-            shape = next(value.shape for value in shapes if value is not None)
             raise unsupported(
                 f"{node} must have a constant of one number for each channel, got {times(shape)}."
             )
@@ -287,10 +286,8 @@ class _Reader:
         """Fuse an activation into the operation before it, or append it as a separate operation."""
         activation = read_activation(self.source, node)
         source = node.source
-        (output,) = node.outputs
-        written = [op.output for op in self.ops]
-        place = written.index(source) if source in written else None
-        producer = None if place is None else self.ops[place]
+        places = {op.output: place for place, op in enumerate(self.ops)}
+        producer = self.ops[places[source]] if source in places else None
         # HardSigmoid and HardSwish are functions of a rounded value, the others of the exact sums.
         excluded = {Activation.hard_sigmoid, Activation.hard_swish}
         if isinstance(producer, Add):
@@ -301,23 +298,15 @@ class _Reader:
             # them in phases.
             excluded.add(Activation.leaky_relu)
         if (
-            place is not None
-            and isinstance(producer, Conv | Add)
+            isinstance(producer, Conv | Add)
             and producer.activation is Activation.none
             and self.source.n_reads(source) == 1
             and activation not in excluded
         ):
-            self.ops[place] = replace(producer, output=output, activation=activation)
+            fused = replace(producer, output=node.result, activation=activation)
+            self.ops[places[source]] = fused
         else:
-            self.ops.append(Pointwise(node.name, source, output, activation))
-
-
-def _stand_in(graph: OnnxGraph, node: Node) -> Op:
-    """Return an operation in place of a node that can be adapted, so that the rest is read."""
-    if node.op_type == "Resize":
-        factor = int(Resizing.of(graph, node).factors[2])
-        return Resize(node.name, node.source, node.result, factor, True)
-    return Pointwise(node.name, node.source, node.result, Activation.hard_sigmoid)
+            self.ops.append(Pointwise(node.name, source, node.result, activation))
 
 
 def _refused(graph: OnnxGraph, node: Node) -> ModelError:

@@ -52,9 +52,7 @@ def network_sha256(path: Path) -> str:
         # It is no network, which the reader of the file reports.
         return digest
     apart = [tensor for tensor in model.graph.initializer if tensor.external_data]
-    files = sorted(
-        {_weights_file(tensor, _entries(tensor).get("location", ""), path) for tensor in apart}
-    )
+    files = sorted({_weights_file(tensor, path) for tensor in apart})
     if not files:
         return digest
     digests = "".join([digest, *map(sha256, files)])
@@ -100,7 +98,7 @@ def _content(tensor: TensorProto, path: Path, limit_bytes: int) -> bytes:
         int(text) if text.isascii() and text.isdigit() and len(text) < 19 else None
         for text in texts
     )
-    file = _weights_file(tensor, entries.get("location", ""), path)
+    file = _weights_file(tensor, path)
     if start is None or length != size or start + size > file.stat().st_size:
         raise _refused(
             tensor, path, f"{file.name!r} does not hold the {size} bytes of these weights"
@@ -110,12 +108,13 @@ def _content(tensor: TensorProto, path: Path, limit_bytes: int) -> bytes:
         return stream.read(size)
 
 
-def _weights_file(tensor: TensorProto, location: str, path: Path) -> Path:
+def _weights_file(tensor: TensorProto, path: Path) -> Path:
     """Return the regular file of the weights, in the model's folder or below and reached by no
     link.
 
     Raises ModelError for any other location.
     """
+    location = _entries(tensor).get("location", "")
     # Files that were written on Windows have backslashes between folders.
     parts = PurePosixPath(location.replace("\\", "/")).parts
     if (

@@ -141,7 +141,7 @@ class Node:
             Rows and columns of the kernel, and strides, pads and dilations; None if the kernel is
             not known, or if it or the attributes are not those of two dimensions.
         """
-        attribute = self.attributes.get
+        attribute = self.attribute
         sides = (
             kernel or attribute("kernel_shape", ()),
             attribute("strides", (1, 1)),
@@ -159,21 +159,26 @@ class Node:
             window = window.padded(auto_pad, (rows, columns), size)
         return (rows, columns), window
 
+    def attribute(self, key: str, otherwise: Any = None) -> Any:
+        """Return an attribute of the node, or `otherwise` if the file does not state it."""
+        return self.attributes.get(key, otherwise)
+
     @property
     def groups(self) -> int:
         """The number of groups of a convolution."""
-        return int(self.attributes.get("group", 1))
+        return int(self.attribute("group", 1))
 
     @property
     def output_padding(self) -> Sequence[int]:
         """The rows and columns that a transposed convolution adds at the end of its result."""
-        return self.attributes.get("output_padding", (0, 0))  # type: ignore[no-any-return]
+        return self.attribute("output_padding", (0, 0))  # type: ignore[no-any-return]
 
 
 NO_NODE = Node("", "", (), ("",), {}, NodeProto())
 """The writer of a tensor that no node writes. Its operator equals none."""
-Rewriting = Callable[["OnnxGraph", Node], list[Node] | None]
-"""A function that returns the nodes that replace a node; None if it stays."""
+Replacement = list[Node] | None
+"""The nodes that replace a node; None if it stays."""
+Rewriting = Callable[["OnnxGraph", Node], Replacement]
 
 
 class OnnxGraph:
@@ -268,11 +273,7 @@ class OnnxGraph:
         )
 
     def tensor_types(self) -> dict[str, TypeProto.Tensor]:
-        """Infer the element type and the sizes of each tensor by ONNX's shape inference.
-
-        Returns:
-            ONNX's types by tensor name; empty if the stated sizes contradict each other.
-        """
+        """Infer ONNX's type of each tensor, which has its sizes; {} if stated sizes contradict."""
         try:
             graph = shape_inference.infer_shapes(self._model).graph
         except shape_inference.InferenceError:
@@ -395,4 +396,4 @@ class OnnxGraph:
         if place < len(node.inputs) and node.inputs[place]:
             value = self.value(node, place)
             return None if value is None else list(value.ravel().tolist())
-        return list(node.attributes.get(key, ()))
+        return list(node.attribute(key, ()))

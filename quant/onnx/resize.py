@@ -57,7 +57,7 @@ class Resizing:
         """
         # Before opset 11 the factors are the second input, and places start at the corner.
         old = node.op_type == "Upsample" or len(node.inputs) == 2
-        attribute = node.attributes.get
+        attribute = node.attribute
         scales = graph.numbers(node, 1 if old else 2, "scales") or []
         axes = [axis % 4 for axis in attribute("axes", range(4))]
         factors = dict(zip(axes, scales, strict=bool(scales)))

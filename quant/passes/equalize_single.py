@@ -22,7 +22,6 @@ small in most channels. With depthwise convolutions everything is tried.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import product
 
 import numpy as np
@@ -41,7 +40,7 @@ from beers_deploy.quant.passes.equalize import (
     stepped,
 )
 from beers_deploy.quant.passes.residual_groups import GROUP_FRAC_BITS, only
-from beers_deploy.quant.passes.trial import Costs, Trial, Trials
+from beers_deploy.quant.passes.trial import Costs, Trials
 
 GAMMAS = (0.0, 0.25, 0.5, 1.0)
 HEADROOM = (0.5, 0.75, 1.0, 1.4)
@@ -125,15 +124,17 @@ class SingleTensors:
             ),
         ]
 
-    def scaled(self, graph: Graph, factors: np.ndarray) -> Graph:
-        """Scale all channels by their factors, without changing the function of the float network.
+    def scaled(self, graph: Graph, factors: np.ndarray, names: Sequence[str] = ()) -> Graph:
+        """Scale channels by their factors, without changing the function of the float network.
 
         Args:
             graph: the float graph to which the tensors belong.
             factors: (sum of the channels,) the factors, above 0.
+            names: the tensors to scale; empty for all.
         """
-        for name, part in self.parts.items():
-            own = factors[part]
+        parts = self.parts
+        for name in names or self.tensors:
+            own = factors[parts[name]]
             graph = equalize(graph, only(name, len(own)), own)
         return graph
 
@@ -190,7 +191,6 @@ def equalize_single(
     graph: Graph,
     singles: SingleTensors,
     ranges: np.ndarray,
-    start: np.ndarray,
     trials: Trials,
     effort: Effort,
     most_groups: int,
@@ -201,14 +201,13 @@ def equalize_single(
         graph: the float graph to which the tensors belong.
         singles: the tensors whose channels are scaled.
         ranges: (sum of the channels,) the ranges of the channels.
-        start: (sum of the channels,) the factors to start from.
         trials: measures the error of candidate graphs in INT8 on crops.
         effort: the effort that the user allows.
         most_groups: the maximum number of groups of channels in a tensor, each of which is tried
             larger and smaller; 0 tries only the guesses for all tensors jointly.
 
     Returns:
-        (sum of the channels,) the best factors; `start` if nothing is better.
+        (sum of the channels,) the best factors; 1 for all if nothing is better.
     """
     weights_of = {
         op.output: np.abs(op.weight).max((1, 2, 3)) for op in graph if isinstance(op, Conv)
@@ -238,13 +237,15 @@ def equalize_single(
                 bar.advance()
         return best
 
+    def costs_in(base: Graph, names: Sequence[str]) -> Callable[[np.ndarray], Costs]:
+        """Return a function for the error with factors of these tensors in a graph."""
+        trial = trials(base, names)
+        return lambda factors: trial(singles.scaled(base, factors, names))
+
     # 3.
-    trial = trials(graph, singles.tensors)
-
-    def costs_of_all(factors: np.ndarray) -> Costs:
-        return trial(singles.scaled(graph, factors))
-
-    best = guessed(Best(start, costs_of_all(start)(None)), singles.tensors, costs_of_all)
+    costs_of = costs_in(graph, singles.tensors)
+    start = np.ones(len(ranges))
+    best = guessed(Best(start, costs_of(start)(None)), singles.tensors, costs_of)
     alone = singles.tried_alone(most_groups)
     with steps("tensors", len(alone)) as bar:
         # 4.
@@ -252,8 +253,7 @@ def equalize_single(
             part = parts[name]
             others = best.factors.copy()
             others[part] = 1.0
-            base = singles.scaled(graph, others)
-            costs_of = partial(_costs_of_one, trials(base, [name]), base, name, part)
+            costs_of = costs_in(singles.scaled(graph, others), [name])
             if singles.guesses_alone(effort):
                 best = guessed(best, [name], costs_of)
             if singles.by_channel:
@@ -261,12 +261,6 @@ def equalize_single(
                 best = stepped(costs_of, [group + part.start for group in groups], best)
             bar.advance()
     return best.factors
-
-
-def _costs_of_one(trial: Trial, graph: Graph, name: str, part: slice, factors: np.ndarray) -> Costs:
-    """Return the error of scaling one tensor of a graph by its part of the factors."""
-    own = factors[part]
-    return trial(equalize(graph, only(name, len(own)), own))
 
 
 def _better(factors: np.ndarray, costs_of: Callable[[np.ndarray], Costs], best: Best) -> Best:

@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 from onnx import ModelProto
 
-from beers_deploy.quant.onnx.graph import NO_NODE, Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import NO_NODE, Node, OnnxGraph, Replacement
 from beers_deploy.quant.simplify.fold_affine import fold_in_front
 
 RISING = {"Clip", "LeakyRelu", "Relu"}
@@ -73,7 +73,7 @@ def behind_convolutions(model: ModelProto) -> ModelProto:
         return model
     graph.infer_shapes()
 
-    def with_copy(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    def with_copy(graph: OnnxGraph, node: Node) -> Replacement:
         source = node.source
         channels = graph.channels(source)
         if not channels or not _lacks_convolution(graph, node):
@@ -109,7 +109,7 @@ def _any_moves(graph: OnnxGraph) -> bool:
     return any(move_in_front(graph, node) is not None for node in graph.nodes)
 
 
-def move_in_front(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def move_in_front(graph: OnnxGraph, node: Node) -> Replacement:
     """Let an activation precede the operation that it reads.
 
     Args:
@@ -148,8 +148,8 @@ def _values(moving: Node) -> tuple[str, ...]:
 def _leads_to_convolutions(graph: OnnxGraph, activation: Node, writer: Node) -> bool:
     """Return True if all that an operation moves comes from convolutions that only it reads."""
     kind = writer.op_type
-    repeats = kind == "Resize" and writer.attributes.get("mode", "nearest") == "nearest"
-    rises = activation.op_type in RISING and activation.attributes.get("alpha", 0) >= 0
+    repeats = kind == "Resize" and writer.attribute("mode", "nearest") == "nearest"
+    rises = activation.op_type in RISING and activation.attribute("alpha", 0) >= 0
     is_maximum = kind == "MaxPool" and rises and len(writer.outputs) == 1
     if not (kind in ("Concat", "DepthToSpace") or repeats or is_maximum):
         return False

@@ -13,7 +13,7 @@ All of it is exact.
 
 import numpy as np
 
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Replacement
 
 BRANCH_AXES = (1, -4)
 
@@ -28,7 +28,7 @@ class JoinBranches:
     def __init__(self) -> None:
         self._maps: dict[str, str] = {}
 
-    def __call__(self, graph: OnnxGraph, node: Node) -> list[Node] | None:
+    def __call__(self, graph: OnnxGraph, node: Node) -> Replacement:
         """Return the nodes that replace a node, or that compute the same map in front of it; None
         if it has no axis of branches.
         """
@@ -56,7 +56,7 @@ class JoinBranches:
     ) -> list[Node]:
         """Return the nodes that compute what a node does, in four axes; none for another node."""
         joined = f"{node.result}.joined"
-        axis = node.attributes.get("axis", -1)
+        axis = node.attribute("axis", -1)
         if node.op_type == "Softmax" and axis in BRANCH_AXES and branches == 2:
             difference = f"{node.result}.difference"
             weight = np.kron([[1, -1], [-1, 1]], np.eye(channels))[..., None, None]
@@ -72,16 +72,14 @@ class JoinBranches:
             return [Node.new("Mul", maps, joined, node.name)]
         return []
 
-    def _out_of(
-        self, graph: OnnxGraph, node: Node, branches: int, channels: int
-    ) -> list[Node] | None:
+    def _out_of(self, graph: OnnxGraph, node: Node, branches: int, channels: int) -> Replacement:
         """Return the nodes that compute a map of all branches, or of one; None for another node."""
         source = self._maps[node.source]
         if node.op_type == "ReduceSum" and graph.numbers(node, 1, "axes") in ([1], [-4]):
             weight = np.tile(np.eye(channels), branches)[..., None, None]
             return [graph.convolution(source, node.result, node.name, weight)]
         place = graph.value(node, 1) if node.op_type == "Gather" else None
-        if place is None or place.ndim or node.attributes.get("axis", 0) not in BRANCH_AXES:
+        if place is None or place.ndim or node.attribute("axis", 0) not in BRANCH_AXES:
             return None
         numbers = np.arange(branches * channels).reshape(branches, channels)[int(place)]
         chosen = graph.add_constant(f"{node.result}.channels", numbers, np.int64)

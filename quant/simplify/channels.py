@@ -20,9 +20,8 @@ All of it is exact. The divided nodes remain, and are removed if nothing reads t
 from dataclasses import replace
 
 import numpy as np
-from onnx import ModelProto
 
-from beers_deploy.quant.onnx.graph import NO_NODE, Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import NO_NODE, Node, OnnxGraph, Replacement
 from beers_deploy.quant.onnx.window import Window
 from beers_deploy.quant.simplify.fold_affine import is_convolution
 from beers_deploy.quant.simplify.slices import slices_of
@@ -35,7 +34,7 @@ HOST = {"Clip", "DepthToSpace"}
 """Operators that the host computes behind the sum with the image."""
 
 
-def split_channels(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def split_channels(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace a Split, Slice or Gather of channels by operations that compute each part by itself
     (points 1 and 2 of the module).
 
@@ -66,13 +65,13 @@ def _parts(graph: OnnxGraph, node: Node) -> list[Part]:
     numbers = np.arange(graph.channels(node.source))
     if not len(numbers):
         return []
-    if node.op_type == "Split" and node.attributes.get("axis", 0) in CHANNEL_AXIS:
+    if node.op_type == "Split" and node.attribute("axis", 0) in CHANNEL_AXIS:
         widths = [graph.channels(name) for name in node.outputs]
         if not all(widths):
             return []
         return list(zip(node.outputs, np.split(numbers, np.cumsum(widths[:-1])), strict=True))
     chosen = graph.value(node, 1) if node.op_type == "Gather" else None
-    if chosen is not None and chosen.ndim == 1 and node.attributes.get("axis", 0) in CHANNEL_AXIS:
+    if chosen is not None and chosen.ndim == 1 and node.attribute("axis", 0) in CHANNEL_AXIS:
         return [(node.result, numbers[chosen])]
     cuts = slices_of(graph, node) if node.op_type == "Slice" else {}
     return [(node.result, numbers[cuts[1]])] if cuts.keys() == {1} else []
@@ -130,7 +129,7 @@ def _groups(graph: OnnxGraph, node: Node) -> int:
     return groups if groups == 1 or (groups == outputs and inputs == 1) else 0
 
 
-def read_unselected(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def read_unselected(graph: OnnxGraph, node: Node) -> Replacement:
     """Let a convolution behind a concat read whole maps in place of selections of most of their
     channels (point 3 of the module).
 
@@ -180,7 +179,7 @@ def _selected(graph: OnnxGraph, node: Node) -> np.ndarray | None:
     return weight[:, :, 0, 0] if is_one_pixel and is_selection else None
 
 
-def repeat_channels(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def repeat_channels(graph: OnnxGraph, node: Node) -> Replacement:
     """Let a convolution repeat the channels of a map that a Tile or arithmetic repeats.
 
     The image that is added at the end is left as it is: the host adds it to each channel.
@@ -209,17 +208,6 @@ def repeat_channels(graph: OnnxGraph, node: Node) -> list[Node] | None:
     repeated = graph.convolution(narrow, name, name, np.ones((channels, 1, 1, 1)))
     node.read_instead(narrow, name)
     return [repeated, node]
-
-
-def broadcasts_channels(model: ModelProto) -> bool:
-    """Return True if a network adds or multiplies maps of one channel and of several.
-
-    Args:
-        model: a float network of few kinds of operators, whose channels ONNX can infer.
-    """
-    graph = OnnxGraph(model)
-    graph.infer_shapes()
-    return any(_narrow_input(graph, node) is not None for node in graph.nodes)
 
 
 def _narrow_input(graph: OnnxGraph, node: Node) -> str | None:

@@ -18,20 +18,15 @@ from typing import Any
 import numpy as np
 from onnx import ModelProto
 
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.elementwise import ELEMENTWISE
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Replacement
 
 TO_FIRST = [0, 3, 1, 2]
 TO_LAST = [0, 2, 3, 1]
 AXES_ARE_INPUT = 18
 """The opset from which on operators read axes as an input."""
-ON_VALUES = {
-    *("Abs", "Add", "Cast", "Clip", "Div", "Dropout", "Elu", "Erf", "Exp", "Gelu", "HardSigmoid"),
-    *("HardSwish", "Identity", "LeakyRelu", "Log", "Max", "Min", "Mul", "Neg", "PRelu", "Pow"),
-    *("Relu", "Sigmoid", "Softplus", "Sqrt", "Sub", "Sum", "Tanh"),
-}
-"""Operators on each value, which no order of axes changes."""
 REDUCING = {"ReduceMax", "ReduceMean", "ReduceSum"}
-ON_ANY_AXIS = {*ON_VALUES, *REDUCING, "Concat", "MatMul", "Pad", "Reshape", "Slice", "Split"}
+ON_ANY_AXIS = ELEMENTWISE | REDUCING | {"Concat", "MatMul", "Pad", "Reshape", "Slice", "Split"}
 """Operators that do not show which axis has the channels."""
 
 
@@ -74,11 +69,11 @@ def _is_last(graph: OnnxGraph, name: str, has_images: bool) -> bool:
     """Return True if a result has its channels last: it is transposed so, or reshaped in a network
     with images of channels last, such as by a pixel shuffle.
     """
-    writer = graph.writers.get(name)
-    while writer is not None and writer.op_type in ON_VALUES:
-        writer = graph.writers.get(writer.source)
-    if writer is None or writer.op_type != "Reshape":
-        return writer is not None and _is_transpose(writer, TO_LAST)
+    source = name
+    while (writer := graph.writer(source)).op_type in ELEMENTWISE:
+        source = writer.source
+    if writer.op_type != "Reshape":
+        return _is_transpose(writer, TO_LAST)
     return has_images and len(graph.result_sizes[name]) == 4
 
 
@@ -95,7 +90,7 @@ def _images_of_channels_last(graph: OnnxGraph) -> set[str]:
     return images
 
 
-def moved_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def moved_behind(graph: OnnxGraph, node: Node) -> Replacement:
     """Move the Transposes to channels last in front of a node behind it (1).
 
     Args:
@@ -106,17 +101,13 @@ def moved_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
         The operation on maps of channels first, and a Transpose of each result; None if the node
         stays.
     """
-    names = [name for name in node.inputs if name and name not in graph.constants]
-    writers = [graph.writers.get(name) for name in names]
-    sources = {
-        writer.result: writer.source
-        for writer in writers
-        if writer is not None and _is_transpose(writer, TO_LAST)
-    }
+    names = {name for name in node.inputs if name and name not in graph.constants}
+    transposes = [w for w in map(graph.writer, node.inputs) if _is_transpose(w, TO_LAST)]
+    sources = {transpose.result: transpose.source for transpose in transposes}
     if pixel := _of_one_pixel(graph, node):
         return _transposed(node, pixel)
     is_single = len(node.outputs) == 1 or node.op_type == "Split"
-    if not names or sources.keys() != {*names} or not is_single:
+    if not names or sources.keys() != names or not is_single:
         return None
     if _is_transpose(node, TO_FIRST):
         return [node.replaced_by("Identity", [*sources.values()])]
@@ -127,7 +118,7 @@ def moved_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return None if on_first is None else _transposed(node, [on_first])
 
 
-def _transposed(node: Node, moved: list[Node]) -> list[Node] | None:
+def _transposed(node: Node, moved: list[Node]) -> Replacement:
     """Return nodes that compute the results of a node with channels first, and their Transposes;
     None if there are no such nodes.
     """
@@ -149,17 +140,15 @@ def _of_one_pixel(graph: OnnxGraph, node: Node) -> list[Node]:
     of channels last that meets such maps; none for other nodes.
     """
     sizes = graph.numbers(node, 1, "") if node.op_type == "Reshape" else None
-    readers = graph.readers[node.result]
-    others = chain.from_iterable(reader.inputs for reader in readers)
-    writers = [graph.writers.get(name) for name in others]
-    meets_last = any(writer is not None and _is_transpose(writer, TO_LAST) for writer in writers)
+    others = chain.from_iterable(reader.inputs for reader in graph.readers[node.result])
+    meets_last = any(_is_transpose(graph.writer(name), TO_LAST) for name in others)
     if (sizes or [])[1:-1] != [1, 1] or not meets_last:
         return []
     name = graph.add_constant(f"{node.result}.sizes", np.array(sizes)[TO_FIRST], np.int64)
     return [node.replaced_by("Reshape", [node.source, name], **node.attributes)]
 
 
-def multiplied(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def multiplied(graph: OnnxGraph, node: Node) -> Replacement:
     """Multiply a map of channels last by a matrix, in place of the same map flattened (3).
 
     Args:
@@ -169,21 +158,20 @@ def multiplied(graph: OnnxGraph, node: Node) -> list[Node] | None:
     Returns:
         The product, and the sum with the bias of a Gemm; None if the node is something else.
     """
-    product = graph.writers.get(node.source) if node.op_type == "Reshape" else None
-    if product is None or product.op_type not in ("Gemm", "MatMul"):
-        return None
-    flat = graph.writers.get(product.source)
+    product = graph.writer(node.source)
+    flat = graph.writer(product.source)
     weight = graph.value(product, 1)
-    if flat is None or flat.op_type != "Reshape" or weight is None:
+    is_flattened = node.op_type == flat.op_type == "Reshape"
+    if not is_flattened or product.op_type not in ("Gemm", "MatMul") or weight is None:
         return None
     names = flat.source, product.source, node.result
     before, rows, after = (graph.shapes.get(name, ()) for name in names)
     is_map = len(before) == len(after) == 4 and before[:3] == after[:3] and len(rows) == 2
-    factors = {product.attributes.get(key, 1) for key in ("alpha", "beta")}
-    if not is_map or before[3] != rows[1] or factors != {1} or product.attributes.get("transA"):
+    factors = {product.attribute(key, 1) for key in ("alpha", "beta")}
+    if not is_map or before[3] != rows[1] or factors != {1} or product.attribute("transA"):
         return None
     result = node.result
-    weight = weight.T if product.attributes.get("transB") else weight
+    weight = weight.T if product.attribute("transB") else weight
     matrix = graph.add_constant(f"{result}.matrix", weight)
     if len(product.inputs) == 2:
         return [node.replaced_by("MatMul", [flat.source, matrix])]
@@ -228,7 +216,7 @@ def _on_first(graph: OnnxGraph, node: Node, sources: Mapping[str, str], first: s
         return Node.new(kind, inputs, first, node.name, **attributes) if axes else None
     if kind in ("Concat", "Split"):
         attributes["axis"] = TO_LAST[attributes.get("axis", 0) % 4]
-    elif kind not in ON_VALUES:
+    elif kind not in ELEMENTWISE:
         return None
     if kind == "Split":
         return Node.new(kind, [source, *node.inputs[1:]], first, node.name, **attributes)
@@ -246,32 +234,31 @@ def _layer_normalization(graph: OnnxGraph, node: Node, source: str, first: str) 
         source: the name of the map with its channels first.
         first: the name of the result.
     """
-    if node.attributes.get("axis", -1) not in (-1, 3):
+    if node.attribute("axis", -1) not in (-1, 3):
         return []
     scale_name, shift_name = (*node.inputs[1:], "")[:2]
     scale = _of_first(graph, scale_name)
     shift = _of_first(graph, shift_name or graph.add_constant(f"{first}.shift", np.zeros(1)))
-    names = ("mean", "difference", "square", "variance", "sum", "root", "quotient", "product")
-    mean, difference, square, variance, total, root, quotient, product = (
-        f"{first}.{name}" for name in names
-    )
     axes = []
     attributes: dict[str, Any] = {"axes": [1]}
     if graph.opset >= AXES_ARE_INPUT:
         axes.append(graph.add_constant(f"{first}.axes", [1], np.int64))
         attributes = {}
-    epsilon = np.array(node.attributes.get("epsilon", 1e-5))
-    return [
-        Node.new("ReduceMean", [source, *axes], mean, **attributes),
-        Node.new("Sub", [source, mean], difference),
-        Node.new("Mul", [difference, difference], square),
-        Node.new("ReduceMean", [square, *axes], variance, **attributes),
-        Node.new("Add", [variance, graph.add_constant(f"{first}.epsilon", epsilon)], total),
-        Node.new("Sqrt", [total], root),
-        Node.new("Div", [difference, root], quotient),
-        Node.new("Mul", [quotient, scale], product),
-        Node.new("Add", [product, shift], first, node.name),
-    ]
+    epsilon = graph.add_constant(f"{first}.epsilon", node.attribute("epsilon", 1e-5))
+    nodes: list[Node] = []
+
+    def computed(op_type: str, inputs: list[str], role: str, **stated: Any) -> str:
+        nodes.append(Node.new(op_type, inputs, f"{first}.{role}", **stated))
+        return nodes[-1].result
+
+    mean = computed("ReduceMean", [source, *axes], "mean", **attributes)
+    difference = computed("Sub", [source, mean], "difference")
+    square = computed("Mul", [difference, difference], "square")
+    variance = computed("ReduceMean", [square, *axes], "variance", **attributes)
+    root = computed("Sqrt", [computed("Add", [variance, epsilon], "sum")], "root")
+    quotient = computed("Div", [difference, root], "quotient")
+    product = computed("Mul", [quotient, scale], "product")
+    return [*nodes, Node.new("Add", [product, shift], first, node.name)]
 
 
 def _of_first(graph: OnnxGraph, name: str) -> str:
@@ -285,4 +272,4 @@ def _of_first(graph: OnnxGraph, name: str) -> str:
 
 def _is_transpose(node: Node, order: list[int]) -> bool:
     """Return True if a node transposes in this order."""
-    return node.op_type == "Transpose" and list(node.attributes.get("perm", [])) == order
+    return node.op_type == "Transpose" and node.attribute("perm") == order

@@ -22,7 +22,7 @@ another way.
 
 import numpy as np
 
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Replacement
 from beers_deploy.quant.simplify.fold_affine import is_convolution
 from beers_deploy.quant.simplify.slices import TO_THE_END, slices_of
 
@@ -38,17 +38,16 @@ LONGEST_SIDE = 16
 
 def leaves_pads(node: Node) -> bool:
     """Return True if the pads of a strided convolution or pool follow from the size of its map."""
-    is_same = str(node.attributes.get("auto_pad", "")).startswith("SAME")
-    return is_same and any(stride > 1 for stride in node.attributes.get("strides", [1]))
+    is_same = str(node.attribute("auto_pad", "")).startswith("SAME")
+    return is_same and any(stride > 1 for stride in node.attribute("strides", [1]))
 
 
 def states_pads(node: Node) -> bool:
     """Return True if a transposed convolution states its pads, and no size of its result."""
-    attributes = node.attributes
-    return attributes.get("auto_pad", "NOTSET") == "NOTSET" and "output_shape" not in attributes
+    return node.attribute("auto_pad", "NOTSET") == "NOTSET" and not node.attribute("output_shape")
 
 
-def without_groups(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def without_groups(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace a convolution of groups or output padding by one without.
 
     Args:
@@ -65,7 +64,7 @@ def without_groups(graph: OnnxGraph, node: Node) -> list[Node] | None:
     rows, columns, *_ = node.output_padding
     is_depthwise = node.op_type == "Conv" and weight.shape[1] == 1 and len(weight) == groups
     if rows or columns:
-        if not states_pads(node) or set(node.attributes.get("dilations", [1])) != {1}:
+        if not states_pads(node) or set(node.attribute("dilations", [1])) != {1}:
             return None
     elif groups == 1 or is_depthwise:
         return None
@@ -89,7 +88,7 @@ def without_groups(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return [Node.new(node.op_type, inputs, node.result, node.proto.name, **attributes)]
 
 
-def crop_by_pads(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def crop_by_pads(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace a crop behind a transposed convolution by padding, which also cuts its result.
 
     Args:
@@ -105,7 +104,7 @@ def crop_by_pads(graph: OnnxGraph, node: Node) -> list[Node] | None:
     cuts = slices_of(graph, node)
     if not cuts or not cuts.keys() <= {2, 3} or not states_pads(before):
         return None
-    pads = list(before.attributes.get("pads", [0] * 4))
+    pads = list(before.attribute("pads", [0] * 4))
     for axis, cut in cuts.items():
         # Stops count from the end.
         stop = 0 if cut.stop >= TO_THE_END else cut.stop
@@ -116,7 +115,7 @@ def crop_by_pads(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return [node.replaced_by("ConvTranspose", before.inputs, **{**before.attributes, "pads": pads})]
 
 
-def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def split_large_kernel(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace a convolution of a large kernel by several of smaller ones, and the sum of their
     results.
 
@@ -142,7 +141,7 @@ def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
         return None
     # A part may have MOST_POSITIONS // columns rows, so this is the least number of parts.
     step = -(-rows // (MOST_POSITIONS // columns))
-    dilations = node.attributes.get("dilations", [1, 1])
+    dilations = node.attribute("dilations", [1, 1])
     name = node.proto.name or node.result
     nodes = []
     parts = []

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Replacement
 
 NORMALISATION = "BatchNormalization"
 LACKING = {NORMALISATION, "Div", "Neg"}
@@ -45,7 +45,7 @@ IDENTITY = Affine(np.ones(1), np.zeros(1))
 NEGATION = Affine(-np.ones(1), np.zeros(1))
 
 
-def add_negated(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def add_negated(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace a - b by a + (-b), where the convolution that computes b is negated, or a product by
     -1 is new (point 1 of the module).
 
@@ -73,7 +73,7 @@ def add_negated(graph: OnnxGraph, node: Node) -> list[Node] | None:
     ]
 
 
-def fold_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def fold_behind(graph: OnnxGraph, node: Node) -> Replacement:
     """Fold a node that scales and shifts channels into the convolution in front of it (point 2 of
     the module).
 
@@ -126,7 +126,7 @@ def fold_in_front(graph: OnnxGraph) -> None:
     graph.set_nodes([node for node in graph.nodes if node not in folded])
 
 
-def convolve_affine(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def convolve_affine(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace a node that scales and shifts channels by a convolution of one pixel (point 4 of the
     module), if it could not be folded and is more than a DPU's product or sum.
 
@@ -172,11 +172,11 @@ def affine_of(graph: OnnxGraph, node: Node) -> tuple[str, Affine] | None:
     """
     if node.op_type == NORMALISATION:
         values = [_float64(graph, node, place) for place in range(1, 5)]
-        is_trained = node.attributes.get("training_mode", 0) or len(node.outputs) > 1
+        is_trained = node.attribute("training_mode", 0) or len(node.outputs) > 1
         if is_trained or any(value is None for value in values):
             return None
         gain, offset, mean, variance = values
-        scale = gain / np.sqrt(variance + node.attributes.get("epsilon", 1e-5))
+        scale = gain / np.sqrt(variance + node.attribute("epsilon", 1e-5))
         return node.source, Affine(scale, offset - mean * scale)
     if node.op_type == "Neg":
         return node.source, NEGATION
@@ -295,9 +295,8 @@ def _may_take_in(graph: OnnxGraph, node: Node, name: str, affine: Affine) -> boo
     """Return True if scale and shift of the tensor `name` can be folded into a convolution that
     reads it.
     """
-    attributes = node.attributes
-    states_pads = attributes.get("auto_pad", "NOTSET") in ("NOTSET", "VALID")
-    unpadded = node.op_type == "Conv" and states_pads and not any(attributes.get("pads", []))
+    states_pads = node.attribute("auto_pad", "NOTSET") in ("NOTSET", "VALID")
+    unpadded = node.op_type == "Conv" and states_pads and not any(node.attribute("pads", []))
     # The zeros of a padding are not shifted, so a shift passes only a convolution without padding.
     exact = unpadded or not affine.shift.any()
     return is_convolution(graph, node) and node.inputs.count(name) == 1 and exact

@@ -24,7 +24,8 @@ import numpy as np
 from onnx import ModelProto
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Rewriting
+from beers_deploy.quant.onnx.elementwise import ELEMENTWISE
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Replacement, Rewriting
 from beers_deploy.quant.onnx.image_input import without_size
 from beers_deploy.quant.onnx.messages import replace_all
 from beers_deploy.quant.simplify.channels_first import TO_LAST, moved_behind, multiplied
@@ -43,12 +44,11 @@ MULTIPLE_PX = 64
 """Six levels of a U-Net halve sides of this length without a remainder."""
 SIZES_PX = (2 * MULTIPLE_PX, 3 * MULTIPLE_PX), (4 * MULTIPLE_PX, 3 * MULTIPLE_PX)
 """Rows and columns differ, so that a network that confuses them is detected."""
-SIZED = {"Concat", "Expand", "Pad", "Resize", "Shape", "Size", "Slice"}
+SIZED = {"Expand", "Pad", "Resize", "Shape", "Size", "Slice"}
 """Operators that may need the size of an image."""
-LOCAL = {
-    *("Add", "AveragePool", "Clip", "Concat", "Conv", "ConvTranspose", "DepthToSpace", "Div"),
-    *("HardSigmoid", "HardSwish", "LeakyRelu", "MaxPool", "Mul", "Pad", "PRelu", "Relu", "Resize"),
-    *("Sigmoid", "SpaceToDepth", "Sub", "Tanh"),
+LOCAL = ELEMENTWISE | {
+    *("AveragePool", "Concat", "Conv", "ConvTranspose", "DepthToSpace", "MaxPool", "Pad"),
+    *("Resize", "SpaceToDepth"),
 }
 """Operators that do the same at every pixel, for images of all sizes."""
 Fold = Callable[[ModelProto], ModelProto]
@@ -84,14 +84,14 @@ def free_sizes(model: ModelProto, fold: Fold) -> ModelProto:
         The network for images whose sides are multiples of MULTIPLE_PX; `model` itself if the size
         has an effect.
     """
-    constants = {tensor.name for tensor in model.graph.initializer}
     graph = OnnxGraph(model)
     if not any(
         is_rearrangement(graph, node)
-        or node.attributes.get("keepdims", 1) == 0
+        or node.attribute("keepdims", 1) == 0
         or leaves_pads(node)
-        or node.attributes.get("perm") == TO_LAST
-        or (node.op_type in SIZED and (node.op_type != "Concat" or constants & {*node.inputs}))
+        or node.attribute("perm") == TO_LAST
+        or node.op_type in SIZED
+        or (node.op_type == "Concat" and graph.constants.keys() & {*node.inputs})
         for node in graph.nodes
     ):
         return model
@@ -142,7 +142,7 @@ def _of_size(model: ModelProto, rows: int, columns: int, fold: Fold) -> ModelPro
     return fold(network)
 
 
-def _sized(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def _sized(graph: OnnxGraph, node: Node) -> Replacement:
     """Return the nodes that replace a node whose input has a known size (2).
 
     Args:
@@ -152,8 +152,7 @@ def _sized(graph: OnnxGraph, node: Node) -> list[Node] | None:
     Returns:
         The nodes with the same result; None if the node stays.
     """
-    source = node.source
-    before = graph.shapes.get(source, ())
+    before = graph.shapes.get(node.source, ())
     after = graph.shapes.get(node.result, ())
     moves = node.op_type == "Transpose" or takes_others(graph, node)
     if moves or (node.op_type in RESHAPING and before != after):
@@ -164,11 +163,11 @@ def _sized(graph: OnnxGraph, node: Node) -> list[Node] | None:
         return SPECIAL[node.op_type](graph, node)
     adds_nothing = node.op_type == "Pad" and graph.numbers(node, 1, "pads") == [0] * 8
     if adds_nothing or node.op_type in RESHAPING:
-        return [node.replaced_by("Identity", [source])]
+        return [node.replaced_by("Identity", [node.source])]
     return None
 
 
-def _cropped(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def _cropped(graph: OnnxGraph, node: Node) -> Replacement:
     """Return a crop whose stops count from the end of rows and columns, as those of all sizes do;
     nothing but another name for a Slice of the whole map, and None for other Slices.
     """
@@ -181,19 +180,19 @@ def _cropped(graph: OnnxGraph, node: Node) -> list[Node] | None:
     if cuts.keys().isdisjoint((2, 3)):
         return None
     stops = {axis: cut.indices(before[axis])[1] - before[axis] for axis, cut in cuts.items()}
-    numbers = (
-        [cut.start for cut in cuts.values()],
-        [stops[axis] or TO_THE_END if axis > 1 else cut.stop for axis, cut in cuts.items()],
-        list(cuts),
-    )
+    numbers = {
+        "starts": [cut.start for cut in cuts.values()],
+        "stops": [(stops[k] or TO_THE_END) if k > 1 else cut.stop for k, cut in cuts.items()],
+        "axes": list(cuts),
+    }
     places = [
         graph.add_constant(f"{node.name}.{role}", values, np.int64)
-        for role, values in zip(("starts", "stops", "axes"), numbers, strict=True)
+        for role, values in numbers.items()
     ]
     return [node.replaced_by("Slice", [node.source, *places])]
 
 
-def _with_pads(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def _with_pads(graph: OnnxGraph, node: Node) -> Replacement:
     """Return a strided window with its pads in place of auto_pad SAME; None if it states them."""
     weight = graph.value(node, 1)
     _, _, rows, columns = graph.shapes[node.source]
@@ -204,7 +203,7 @@ def _with_pads(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return [node.replaced_by(node.op_type, node.inputs, **attributes)]
 
 
-def _by_factors(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def _by_factors(graph: OnnxGraph, node: Node) -> Replacement:
     """Return a Resize by factors in place of one to a size; None if no whole number divides one of
     the sizes into the other, so that factors may be rounded, and the result have another size.
     """
@@ -221,7 +220,7 @@ def _by_factors(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return [node.replaced_by("Resize", inputs, **attributes)]
 
 
-def _expanded(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def _expanded(graph: OnnxGraph, node: Node) -> Replacement:
     """Return nothing but another name for an Expand without effect, or the convolution that repeats
     a map of one channel; None for other Expands.
     """
@@ -243,8 +242,7 @@ def _is_broadcast_anyway(graph: OnnxGraph, node: Node) -> bool:
     large = {
         name
         for name, size in graph.shapes.items()
-        if size == graph.shapes[result]
-        and (name not in graph.writers or graph.writers[name].op_type != "Expand")
+        if size == graph.shapes[result] and graph.writer(name).op_type != "Expand"
     }
     return result not in graph.outputs and all(
         reader.op_type in ("Add", "Mul", "Sub") and not large.isdisjoint(reader.inputs)
@@ -252,7 +250,7 @@ def _is_broadcast_anyway(graph: OnnxGraph, node: Node) -> bool:
     )
 
 
-def _with_written_maps(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def _with_written_maps(graph: OnnxGraph, node: Node) -> Replacement:
     """Return a Concat whose constant maps are written by convolutions with weights of zero.
 
     Args:
@@ -294,14 +292,14 @@ SPECIAL: dict[str, Rewriting] = {
 """The function for each operator that returns the nodes which replace one."""
 
 
-def _with_kept_axis(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def _with_kept_axis(graph: OnnxGraph, node: Node) -> Replacement:
     """Return the mean of a map over its channels, times a constant, in place of one that drops the
     axis, which a Reshape adds again, as torch writes a variance; None if the node is no such
     Reshape.
     """
     source, affine = affine_chain(graph, node.source)
-    mean = graph.writers.get(source)
-    if mean is None or mean.op_type != "ReduceMean" or graph.numbers(mean, 1, "axes") != [1]:
+    mean = graph.writer(source)
+    if mean.op_type != "ReduceMean" or graph.numbers(mean, 1, "axes") != [1]:
         return None
     batch, _, *sides = graph.shapes.get(mean.source, (0, 0))
     is_kept = len(sides) == 2 and graph.shapes.get(node.result) == (batch, 1, *sides)

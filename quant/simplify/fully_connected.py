@@ -16,7 +16,7 @@ from math import prod
 
 import numpy as np
 
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Replacement
 
 POINTWISE = {"Clip", "Elu", "HardSigmoid", "HardSwish", "LeakyRelu", "Relu", "Sigmoid", "Tanh"}
 ARITHMETIC = {"Add", "Div", "Mul", "Sub"}
@@ -35,7 +35,7 @@ class ConnectByConvolutions:
     def __init__(self) -> None:
         self._maps: dict[str, tuple[str, Map]] = {}
 
-    def __call__(self, graph: OnnxGraph, node: Node) -> list[Node] | None:
+    def __call__(self, graph: OnnxGraph, node: Node) -> Replacement:
         """Return the nodes that replace a node, an empty list if it is not needed, and None if it
         stays.
         """
@@ -48,7 +48,7 @@ class ConnectByConvolutions:
         source, size = self._maps[name]
         if node.op_type == "Gemm":
             return self._connected(graph, node, source, size)
-        is_over_channels = size[1:] == (1, 1) and node.attributes.get("axis", -1) in (1, -1)
+        is_over_channels = size[1:] == (1, 1) and node.attribute("axis", -1) in (1, -1)
         if node.op_type == "Softmax" and is_over_channels:
             softmax = Node.new("Softmax", [source], node.result, node.proto.name, axis=1)
             return self._flat(softmax, size)
@@ -71,22 +71,22 @@ class ConnectByConvolutions:
         if len(sizes) != 4 or min(sizes[1:]) < 1:
             return False
         if node.op_type == "Flatten":
-            return node.attributes.get("axis", 1) in (1, -3)
+            return node.attribute("axis", 1) in (1, -3)
         operand = graph.numbers(node, 1, "") or []
         if node.op_type == "Squeeze" and operand:
             return {axis % 4 for axis in operand} == {2, 3}
-        if node.op_type != "Reshape" or len(operand) != 2 or node.attributes.get("allowzero", 0):
+        if node.op_type != "Reshape" or len(operand) != 2 or node.attribute("allowzero", 0):
             return False
         # In ONNX's Reshape a 0 copies the source's size and -1 stands for the remaining values.
         rows, columns = operand
         return columns == prod(sizes[1:]) or (columns == -1 and rows in (0, sizes[0]))
 
-    def _connected(self, graph: OnnxGraph, node: Node, source: str, size: Map) -> list[Node] | None:
+    def _connected(self, graph: OnnxGraph, node: Node, source: str, size: Map) -> Replacement:
         """Return the convolution that computes a Gemm on a map of this size (2)."""
         weight = graph.value(node, 1)
         bias = graph.value(node, 2)
         bias = bias if any(node.inputs[2:]) else np.zeros(1)
-        attribute = node.attributes.get
+        attribute = node.attribute
         if weight is None or bias is None or weight.ndim != 2 or attribute("transA", 0):
             return None
         weight = weight if attribute("transB", 0) else weight.T
@@ -106,7 +106,7 @@ class ConnectByConvolutions:
         return [image, Node.new("Flatten", image.outputs, name, f"{name}.flat")]
 
 
-def connect_neighbours(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def connect_neighbours(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace a convolution along the channels of one pixel by one of that pixel (5).
 
     Args:
@@ -132,7 +132,7 @@ def connect_neighbours(graph: OnnxGraph, node: Node) -> list[Node] | None:
         return None
     taps = weight.ravel()
     pad = len(taps) // 2
-    attribute = convolution.attributes.get
+    attribute = convolution.attribute
     is_plain = attribute("strides", [1]) == attribute("dilations", [1]) == [1]
     if attribute("pads") != [pad] * 2 or not is_plain:
         return None

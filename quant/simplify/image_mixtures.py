@@ -16,7 +16,7 @@ sharpens colours by panchromatic detail, INT8 then lost 0.8 instead of 2.2 dB (m
 
 import numpy as np
 
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Replacement
 from beers_deploy.quant.onnx.window import Window
 from beers_deploy.quant.simplify.convolutions import MOST_POSITIONS
 from beers_deploy.quant.simplify.fold_affine import affine_of, is_convolution
@@ -39,7 +39,7 @@ class ReadImage:
         # For each mixture the matrix (O, C).
         self._mixtures = {self.image: np.eye(channels)} if channels else {}
 
-    def __call__(self, graph: OnnxGraph, node: Node) -> list[Node] | None:
+    def __call__(self, graph: OnnxGraph, node: Node) -> Replacement:
         """Let a convolution of the image compute what a node computes from mixtures.
 
         Args:
@@ -60,7 +60,7 @@ class ReadImage:
             return None
         return [graph.convolution(self.image, node.result, node.name, mixture[..., None, None])]
 
-    def _of_convolution(self, graph: OnnxGraph, node: Node) -> list[Node] | None:
+    def _of_convolution(self, graph: OnnxGraph, node: Node) -> Replacement:
         """Note the result of a convolution if it is a mixture, and return the one that replaces it
         (point 1).
         """
@@ -97,7 +97,7 @@ class ReadImage:
         mixtures = [self._mixtures[name] for name in node.inputs if name in self._mixtures]
         if len(mixtures) < max(len(node.inputs), 1):
             return None
-        if node.op_type == "Concat" and node.attributes.get("axis") in (1, -3):
+        if node.op_type == "Concat" and node.attribute("axis") in (1, -3):
             return np.concatenate(mixtures)
         is_sum = node.op_type == "Add" and len(mixtures[0]) == len(mixtures[1])
         return mixtures[0] + mixtures[1] if is_sum else None

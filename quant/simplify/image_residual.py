@@ -13,11 +13,9 @@ network, INT8 then lost 0.10 instead of 1.20 dB (measured). All of it is exact e
 rounding of float32.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Replacement
 from beers_deploy.quant.simplify.fold_affine import Affine, affine_chain
 from beers_deploy.quant.simplify.spelled_activations import joint_limits
 
@@ -25,7 +23,7 @@ SAME = 1e-6
 """The relative error of constants that undo one another: a few roundings of float32."""
 
 
-def clip_last(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def clip_last(graph: OnnxGraph, node: Node) -> Replacement:
     """Let one Clip follow the arithmetic with one constant that ends a network (point 1).
 
     Args:
@@ -67,7 +65,7 @@ def _scaled(graph: OnnxGraph, source: str, name: str, affine: Affine) -> list[No
     return nodes
 
 
-def add_to_image(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def add_to_image(graph: OnnxGraph, node: Node) -> Replacement:
     """Add a correction to the image itself, where a network normalises the image and undoes that
     behind the sum (point 2).
 
@@ -84,7 +82,14 @@ def add_to_image(graph: OnnxGraph, node: Node) -> list[Node] | None:
         return None
     for name, other in total.orders:
         image, before = affine_chain(graph, name, is_sole=False)
-        if image in graph.inputs and name != image and _undoes(behind, before, graph.inputs[image]):
+        if name == image or len(graph.inputs.get(image, ())) != 4:
+            continue
+        is_undone = np.allclose(behind.scale * before.scale, 1, 0, SAME) and np.allclose(
+            behind.scale * before.shift, -behind.shift, SAME, SAME
+        )
+        # A grey image may get channels by its normalisation.
+        channels = max(behind.channels, before.channels)
+        if is_undone and channels in (1, graph.inputs[image][1]):
             result = node.result
             factor = graph.add_constant(f"{result}.scale", behind.scale.reshape(1, -1, 1, 1))
             correction = f"{result}.correction"
@@ -93,12 +98,3 @@ def add_to_image(graph: OnnxGraph, node: Node) -> list[Node] | None:
                 node.replaced_by("Add", [image, correction]),
             ]
     return None
-
-
-def _undoes(behind: Affine, before: Affine, sizes: Sequence[int]) -> bool:
-    """Return True if one scaling and shift undoes another of an image of these sizes."""
-    scale = behind.scale * before.scale
-    shifts = behind.scale * before.shift, behind.shift
-    is_same = np.allclose(scale, 1, 0, SAME) and np.allclose(shifts[0], -shifts[1], SAME, SAME)
-    # A grey image may get channels by its normalisation.
-    return len(sizes) == 4 and max(behind.channels, before.channels) in (1, sizes[1]) and is_same

@@ -41,7 +41,7 @@ def with_missing_border(model: ModelProto) -> ModelProto:
     nodes = OnnxGraph(model).nodes
     # Zeros that a layer pads with would lie beyond the mirrored border, not at the image's.
     is_padded = any(
-        node.op_type == "Pad" or (node.op_type in WINDOWS and any(node.attributes.get("pads", ())))
+        node.op_type == "Pad" or (node.op_type in WINDOWS and any(node.attribute("pads", ())))
         for node in nodes
     )
     reads_all = any(node.op_type.startswith(WHOLE_IMAGE) for node in nodes)

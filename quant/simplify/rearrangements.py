@@ -21,7 +21,7 @@ from functools import partial, reduce
 
 import numpy as np
 
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Replacement
 
 RESHAPING = {"Flatten", "Reshape", "Squeeze", "Unsqueeze"}
 """Operators that move no value."""
@@ -40,7 +40,7 @@ MOST_VALUES = 1 << 24
 
 def is_rearrangement(graph: OnnxGraph, node: Node) -> bool:
     """Return True if a node may belong to a chain that moves values, behind the image."""
-    perm = node.attributes.get("perm", ())
+    perm = node.attribute("perm", ())
     sizes = graph.value(graph.writer(node.source), 1)
     is_read_as_shuffle = perm in PIXEL_SHUFFLES.values() and sizes is not None
     is_one = len(perm) > 4 and not is_read_as_shuffle
@@ -57,7 +57,7 @@ def takes_others(graph: OnnxGraph, node: Node) -> bool:
     return places is not None and places.ndim != 1
 
 
-def rearranged(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def rearranged(graph: OnnxGraph, node: Node) -> Replacement:
     """Return one operator that replaces a node and those in front of it.
 
     Args:
@@ -99,7 +99,7 @@ def rearranged(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
 def _enlarged(
     graph: OnnxGraph, node: Node, source: str, image: np.ndarray, moved: np.ndarray
-) -> list[Node] | None:
+) -> Replacement:
     """Return the operator that enlarges a map of numbers so; None if it is no enlargement (2)."""
     factor = moved.shape[2] // image.shape[2]
     if np.array_equal(moved, image.repeat(factor, 2).repeat(factor, 3)):
@@ -127,7 +127,7 @@ def _moved(graph: OnnxGraph, values: np.ndarray, node: Node) -> np.ndarray:
     """Return the result of a node for these values."""
     size = graph.shapes[node.result]
     if node.op_type == "Transpose":
-        return values.transpose(node.attributes.get("perm"))
+        return values.transpose(node.attribute("perm"))
     if node.op_type == "Expand":
         return np.broadcast_to(values, size)
     if node.op_type == "Tile":
@@ -136,7 +136,7 @@ def _moved(graph: OnnxGraph, values: np.ndarray, node: Node) -> np.ndarray:
         return values.reshape(size)
     chosen = graph.value(node, 1)
     if chosen is not None and node.op_type == "Gather":
-        return np.asarray(values.take(chosen, node.attributes.get("axis", 0)))
+        return np.asarray(values.take(chosen, node.attribute("axis", 0)))
     if chosen is not None and chosen.ndim == 2 and chosen.shape[1] == 1:
         return np.asarray(values[chosen[:, 0]])
     # A number that no map has.

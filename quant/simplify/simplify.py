@@ -62,7 +62,6 @@ from beers_deploy.quant.simplify.activations_first import (
 )
 from beers_deploy.quant.simplify.branches import JoinBranches
 from beers_deploy.quant.simplify.channels import (
-    broadcasts_channels,
     read_unselected,
     repeat_channels,
     split_channels,
@@ -248,11 +247,14 @@ def _is_plain(model: ModelProto) -> bool:
     if not is_of_plain_operators:
         return False
     graph = OnnxGraph(model)
-    rewritings: list[Rewriting] = [without_groups, split_large_kernel, ReadImage(graph)]
-    has_other_convolutions = any(
-        rewriting(graph, node) for node, rewriting in product(graph.nodes, rewritings)
-    )
-    return not has_other_convolutions and not broadcasts_channels(model)
+    graph.infer_shapes()
+    rewritings: list[Rewriting] = [
+        without_groups,
+        split_large_kernel,
+        ReadImage(graph),
+        repeat_channels,
+    ]
+    return not any(rewriting(graph, node) for node, rewriting in product(graph.nodes, rewritings))
 
 
 def _to_float_image(graph: GraphProto) -> None:

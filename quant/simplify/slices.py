@@ -16,7 +16,7 @@ image.
 
 import numpy as np
 
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Replacement
 from beers_deploy.quant.simplify.fold_affine import is_convolution
 
 BLOCKS = (2, 3, 4)
@@ -46,7 +46,7 @@ def slices_of(graph: OnnxGraph, node: Node) -> dict[int, slice]:
     }
 
 
-def unshuffle_slices(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def unshuffle_slices(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace slices of every n-th pixel that are concatenated by one pixel unshuffle (point 1 of
     the module).
 
@@ -58,7 +58,7 @@ def unshuffle_slices(graph: OnnxGraph, node: Node) -> list[Node] | None:
     Returns:
         The pixel unshuffle (SpaceToDepth); None if the node stays.
     """
-    if node.op_type != "Concat" or node.attributes.get("axis") not in (1, -3):
+    if node.op_type != "Concat" or node.attribute("axis") not in (1, -3):
         return None
     origins = {_origin(graph, name)[0] for name in node.inputs}
     source, *others = origins
@@ -126,7 +126,7 @@ def _order(graph: OnnxGraph, node: Node, channels: int, block: int) -> np.ndarra
     return order if np.array_equal(unshuffled[:, order], result) else None
 
 
-def convolve_slice(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def convolve_slice(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace a Slice that crops a map, or selects every n-th pixel, by a depthwise convolution.
 
     Args:

@@ -14,7 +14,7 @@ from math import pi, sqrt
 
 import numpy as np
 
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Replacement
 from beers_deploy.quant.simplify.fold_affine import affine_chain
 
 UNLIMITED = 1e30
@@ -23,7 +23,7 @@ SLOPE_AND_OFFSET = {"alpha": 1 / 6, "beta": 0.5}
 """Slope and offset of the HardSigmoid in HardSwish; ONNX's default slope differs."""
 
 
-def join_clips(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def join_clips(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace nodes that clip one after the other by one Relu or Clip from 0 to 6 (point 1 of the
     module).
 
@@ -107,7 +107,7 @@ def _limits(graph: OnnxGraph, node: Node) -> tuple[str, float, float] | None:
     return None
 
 
-def join_hard_swish(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def join_hard_swish(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace nodes that together compute a HardSwish or a HardSigmoid by that operator (point 2 of
     the module).
 
@@ -129,7 +129,7 @@ def join_hard_swish(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return [node.replaced_by("HardSwish", [source])] if source else None
 
 
-def join_sigmoid(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def join_sigmoid(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace (Tanh(x) + 1) / 2, in any spelling, by Sigmoid(2 x) (point 3 of the module).
 
     Args:
@@ -152,7 +152,7 @@ def join_sigmoid(graph: OnnxGraph, node: Node) -> list[Node] | None:
     ]
 
 
-def halve_before_gelu(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def halve_before_gelu(graph: OnnxGraph, node: Node) -> Replacement:
     """Move the factor 1/2 of a GELU in front of its product (point 4 of the module).
 
     Args:
@@ -230,7 +230,7 @@ def has_slope_of_dpu(node: Node) -> bool:
 
 def slope_and_offset(node: Node) -> tuple[float, float]:
     """Return the slope and the offset of a HardSigmoid, with ONNX's defaults filled in."""
-    return node.attributes.get("alpha", 0.2), node.attributes.get("beta", 0.5)
+    return node.attribute("alpha", 0.2), node.attribute("beta", 0.5)
 
 
 def _shifted_and_clipped(graph: OnnxGraph, name: str) -> str:

@@ -3,11 +3,11 @@
 import numpy as np
 from onnx import TensorProto
 
-from beers_deploy.quant.onnx.graph import NO_NODE, Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import NO_NODE, Node, OnnxGraph, Replacement
 from beers_deploy.quant.onnx.resize import PLACES, ROUNDINGS, Resizing
 
 
-def split_sums(_: OnnxGraph, node: Node) -> list[Node] | None:
+def split_sums(_: OnnxGraph, node: Node) -> Replacement:
     """Replace a Sum of several tensors by Adds of two, one after the other.
 
     Args:
@@ -27,7 +27,7 @@ def split_sums(_: OnnxGraph, node: Node) -> list[Node] | None:
     return [*adds, Node.new("Add", [subtotal, last], node.result, node.proto.name)]
 
 
-def split_soft_threshold(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def split_soft_threshold(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace a soft threshold, as unfolded optimisers such as ISTA-Net have it, by two ReLUs:
     Sign(x) ReLU(Abs(x) - t) = ReLU(x - t) - ReLU(-x - t) for t >= 0.
 
@@ -60,7 +60,7 @@ def split_soft_threshold(graph: OnnxGraph, node: Node) -> list[Node] | None:
     ]
 
 
-def choose_by_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def choose_by_relu(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace the larger or the smaller of two maps, and the size of a map, by sums with ReLU:
     max(a, b) = a + ReLU(b - a), min(a, b) = a - ReLU(a - b), and abs(a) = ReLU(a) + ReLU(-a).
 
@@ -96,7 +96,7 @@ def choose_by_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
     ]
 
 
-def replace_powers(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def replace_powers(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace the square and the cube of a map by its products with itself, and a power of 0.5 by
     the root.
 
@@ -120,7 +120,7 @@ def replace_powers(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return [node.replaced_by("Sqrt", [node.source])] if power == 0.5 else None
 
 
-def divide_by_reciprocal(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def divide_by_reciprocal(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace a product with a Reciprocal by a quotient, as torch writes rsqrt.
 
     Args:
@@ -137,7 +137,7 @@ def divide_by_reciprocal(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return None
 
 
-def drop_where(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def drop_where(graph: OnnxGraph, node: Node) -> Replacement:
     """Remove a Where by a constant that chooses one of two maps everywhere, as torch writes a lerp.
 
     Args:
@@ -160,7 +160,7 @@ def drop_where(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return []
 
 
-def drop_cast_or_reshape(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def drop_cast_or_reshape(graph: OnnxGraph, node: Node) -> Replacement:
     """Remove a Cast to float32 of a tensor that is float32 already, and a Reshape to its own size.
 
     onnxruntime leaves such a Cast if it writes a result. torch writes such a Reshape around an
@@ -189,7 +189,7 @@ def _keeps_sides(graph: OnnxGraph, node: Node, sides: tuple[int, ...]) -> bool:
     """
     stated = graph.numbers(node, 1, "") or ()
     is_kept = [number in (0, -1, side) for number, side in zip(stated, sides, strict=False)]
-    return len(stated) == len(sides) and all(is_kept) and not node.attributes.get("allowzero", 0)
+    return len(stated) == len(sides) and all(is_kept) and not node.attribute("allowzero", 0)
 
 
 def reduced_axes(graph: OnnxGraph, node: Node) -> set[int]:
@@ -204,7 +204,7 @@ def reduced_axes(graph: OnnxGraph, node: Node) -> set[int]:
     return {axis % 4 for axis in graph.numbers(node, 1, "axes") or ()}
 
 
-def pool_mean(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def pool_mean(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace a mean over rows and columns by GlobalAveragePool, and a Flatten if both axes are
     dropped, and a sum or mean over channels by a convolution of one pixel.
 
@@ -220,7 +220,7 @@ def pool_mean(graph: OnnxGraph, node: Node) -> list[Node] | None:
         return None
     axes = reduced_axes(graph, node)
     output = node.result
-    keeps_axes = node.attributes.get("keepdims", 1)
+    keeps_axes = node.attribute("keepdims", 1)
     if axes == {1} and size[1] and keeps_axes:
         # A layer normalisation, which has a root, is refused by its mean.
         if any(other.op_type == "Sqrt" for other in graph.nodes):
@@ -241,7 +241,7 @@ def pool_mean(graph: OnnxGraph, node: Node) -> list[Node] | None:
     ]
 
 
-def pool_sums(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def pool_sums(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace sums over rows and columns, divided by the number of pixels, by GlobalAveragePool.
 
     Args:
@@ -255,7 +255,7 @@ def pool_sums(graph: OnnxGraph, node: Node) -> list[Node] | None:
     axes: set[int] = set()
     name = node.source
     while (total := graph.writer(name)).op_type == "ReduceSum":
-        if not total.attributes.get("keepdims", 1):
+        if not total.attribute("keepdims", 1):
             return None
         axes |= reduced_axes(graph, total)
         name = total.source
@@ -265,7 +265,7 @@ def pool_sums(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return [node.replaced_by("GlobalAveragePool", [name])]
 
 
-def pool_maximum(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def pool_maximum(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace a maximum over rows and columns of known number by a MaxPool, and one over channels
     by maxima of two halves, until one channel is left: max(a, b) = b + ReLU(a - b).
 
@@ -282,7 +282,7 @@ def pool_maximum(graph: OnnxGraph, node: Node) -> list[Node] | None:
     size = graph.shapes.get(source, ())
     axes = reduced_axes(graph, node)
     result = node.result
-    if len(size) != 4 or not node.attributes.get("keepdims", 1):
+    if len(size) != 4 or not node.attribute("keepdims", 1):
         return None
     is_global = node.op_type == "GlobalMaxPool" or axes == {2, 3}
     if is_global and all(size[2:]):
@@ -310,7 +310,7 @@ def pool_maximum(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return nodes or [graph.convolution(source, result, node.name, np.ones((1, 1, 1, 1)))]
 
 
-def shrink_by_convolution(graph: OnnxGraph, node: Node) -> list[Node] | None:
+def shrink_by_convolution(graph: OnnxGraph, node: Node) -> Replacement:
     """Replace a Resize to every n-th part of rows and columns by a depthwise convolution.
 
     Its kernel of n x n pixels and stride n has the weights of the interpolation.
@@ -322,7 +322,7 @@ def shrink_by_convolution(graph: OnnxGraph, node: Node) -> list[Node] | None:
     Returns:
         The convolution; None if the node is something else, or reads pixels beyond its block.
     """
-    if node.op_type != "Resize" or node.attributes.get("antialias", 0):
+    if node.op_type != "Resize" or node.attribute("antialias", 0):
         return None
     resizing = Resizing.of(graph, node)
     channels = graph.channels(node.source)

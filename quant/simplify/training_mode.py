@@ -45,11 +45,11 @@ def _is_in_training(graph: OnnxGraph, node: Node, opset: int) -> bool:
     if node.op_type not in ("BatchNormalization", "Dropout"):
         return False
     if opset <= IS_TEST_UNTIL:
-        return not node.attributes.get("is_test", 0)
+        return not node.attribute("is_test", 0)
     if node.op_type == "BatchNormalization":
         # Further results are the running mean and variance, which only training computes. From
         # opset 14 on an attribute states it as well.
-        return bool(node.attributes.get("training_mode", 0)) or any(node.outputs[1:])
+        return bool(node.attribute("training_mode", 0)) or any(node.outputs[1:])
     if not any(node.inputs[DROPOUT_MODE_INPUT:]):
         return False
     # A mode that is computed could be anything when the network runs.

@@ -18,6 +18,8 @@ from beers_deploy.quant.onnx.graph import WEIGHTS, Node, OnnxGraph
 from beers_deploy.quant.onnx.resize import PLACES, ROUNDINGS, Resizing
 from beers_deploy.quant.onnx.runnable import WINDOW_PX
 from beers_deploy.quant.onnx.window import Window
+from beers_deploy.quant.simplify.convolutions import states_pads
+from beers_deploy.quant.simplify.slices import TO_THE_END
 from beers_deploy.quant.untrusted import times
 
 
@@ -98,7 +100,7 @@ class AxisNode:
 
     def attribute(self, key: str, otherwise: Any) -> Any:
         """Return an attribute of the node, or `otherwise` if the node does not state it."""
-        return self.node.attributes.get(key, otherwise)
+        return self.node.attribute(key, otherwise)
 
     def numbers(self, place: int, key: str, otherwise: Sequence[float] = ()) -> list[Any]:
         """Return the numbers that the node states in a constant input or, in older opsets, in an
@@ -179,11 +181,7 @@ def _slide(at: AxisNode) -> AxisMap:
 
 
 def _transpose(at: AxisNode) -> AxisMap:
-    has_pads = (
-        at.attribute("auto_pad", "NOTSET") == "NOTSET"
-        and at.attribute("output_shape", None) is None
-    )
-    at.require(has_pads, "has a fixed or automatic size")
+    at.require(states_pads(at.node), "has a fixed or automatic size")
     kernel, window = _window(at)
     return at.transpose(window, kernel)
 
@@ -211,10 +209,6 @@ def _pad(at: AxisNode) -> AxisMap:
     return replace(step, mirrored=max(ends) if mode == "reflect" else 0)
 
 
-FAR = 1 << 30
-"""An end of a slice from which on it means the image's own end."""
-
-
 def _slice(at: AxisNode) -> AxisMap:
     """Return the map of a Slice that cuts relative to the borders, or that selects every n-th
     pixel.
@@ -226,10 +220,11 @@ def _slice(at: AxisNode) -> AxisMap:
     axes = at.numbers(3, "axes", range(len(starts)))
     steps = at.numbers(4, "steps", [1] * len(starts))
     start = at.own(starts, axes, 0)
-    end = at.own(ends, axes, FAR)
+    end = at.own(ends, axes, TO_THE_END)
     step = at.own(steps, axes, 1)
     # A start from the end or an end from the start lies elsewhere for each size of the image.
-    at.require(start >= 0 and step > 0 and (end < 0 or end >= FAR), "cuts at a fixed position")
+    is_relative = start >= 0 and step > 0 and not 0 <= end < TO_THE_END
+    at.require(is_relative, "cuts at a fixed position")
     behind = min(end, 0)
     return at.slide(Window(strides=(step, step), pads=(-start, -start, behind, behind)))
 
@@ -258,10 +253,8 @@ def _resize(at: AxisNode) -> AxisMap:
         "uses coordinates that depend on the size",
     )
     blends = resizing.mode != "nearest"
-    antialias = " with antialiasing" if at.attribute("antialias", 0) else ""
     at.require(
-        not antialias,
-        f"resizes in mode {resizing.mode}{antialias}",
+        not at.attribute("antialias", 0), f"resizes in mode {resizing.mode} with antialiasing"
     )
     # Weights that are multiples of a power of two are exact floats, so that the same sum is rounded
     # alike at every place.

@@ -30,6 +30,7 @@ from onnx import ModelProto, TypeProto
 
 from beers_deploy.profiles.errors import ModelError, counted
 from beers_deploy.quant.graph.pixel_shuffle import MOVES, with_shuffles
+from beers_deploy.quant.onnx.elementwise import ELEMENTWISE
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.image_input import fixed_tile_px
 from beers_deploy.quant.onnx.messages import sizes_of
@@ -302,66 +303,11 @@ def _require_pointwise(at: AxisNode) -> None:
             (why for why, marks in WHY.items() if any(mark in kind for mark in marks)),
             "is not known to do so",
         )
-        at.require(kind in POINTWISE, why)
+        at.require(kind in ELEMENTWISE, why)
         flat = all(set(at.shapes.get(name, ())[-2:]) <= {1} for name in at.node.inputs)
         at.require(flat, "has a constant that differs from pixel to pixel")
 
 
-POINTWISE = {
-    "Abs",
-    "Add",
-    "And",
-    "Cast",
-    "Ceil",
-    "Celu",
-    "Clip",
-    "Div",
-    "Dropout",
-    "Elu",
-    "Equal",
-    "Erf",
-    "Exp",
-    "Floor",
-    "Gelu",
-    "Greater",
-    "GreaterOrEqual",
-    "HardSigmoid",
-    "HardSwish",
-    "Identity",
-    "LeakyRelu",
-    "Less",
-    "LessOrEqual",
-    "Log",
-    "Max",
-    "Mean",
-    "Min",
-    "Mish",
-    "Mul",
-    "Neg",
-    "Not",
-    "Or",
-    "PRelu",
-    "Pow",
-    "QLinearAdd",
-    "QLinearLeakyRelu",
-    "QLinearMul",
-    "QLinearSigmoid",
-    "Reciprocal",
-    "Relu",
-    "Round",
-    "Selu",
-    "Sigmoid",
-    "Sign",
-    "Softplus",
-    "Softsign",
-    "Sqrt",
-    "Sub",
-    "Sum",
-    "Tanh",
-    "ThresholdedRelu",
-    "Where",
-    "Xor",
-}
 AXES = {
     **dict.fromkeys(("BatchNormalization", "DequantizeLinear", "QuantizeLinear"), 1),
     **dict.fromkeys(("Concat", "QLinearConcat", "Softmax", "Split"), 0),
