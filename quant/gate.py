@@ -187,8 +187,7 @@ def compare(
     counts = np.zeros(BINS, np.int64)
     dn_counts = np.zeros(2 * MAX_DN + 1, np.int64)
     differences = []
-    changes = []
-    contrasts = []
+    rows = []
     errors = []
     metric_values = []
     unfit = []
@@ -202,8 +201,10 @@ def compare(
         dn = np.rint(np.nan_to_num(difference).clip(-1, 1) * MAX_DN).astype(np.int64) + MAX_DN
         dn_counts += np.bincount(dn, minlength=len(dn_counts))
         same_shape = in_float.shape == degraded.shape
-        changes.append(float(np.abs(in_float - degraded).mean()) if same_shape else math.nan)
-        contrasts.append(float(np.abs(in_float - in_float.mean()).mean()))
+        change = float(np.abs(in_float - degraded).mean()) if same_shape else math.nan
+        contrast = np.abs(in_float - in_float.mean()).mean()
+        sizes = np.abs(difference)
+        rows.append([float(sizes.mean()), float(sizes.max()), change, float(contrast)])
         if reference.shape != in_float.shape:
             unfit.append(number)
         elif ranges or patches.ranges:
@@ -225,6 +226,7 @@ def compare(
         # A mean over some of them would be NaN, and its check left out.
         raise unfit_reference(patches, unfit[0], "the mean PSNR")
     everything = np.concatenate(differences).astype(np.float64)
+    maes, largest, changes, contrasts = np.array(rows).T
     degraded_db, float_db, int8_db = np.mean(errors, axis=0).tolist()
     metric_float, metric_int8 = np.mean(metric_values or [[math.nan] * 2], axis=0).tolist()
     return GateResult(
@@ -242,14 +244,10 @@ def compare(
         metric_float=metric_float,
         metric_int8=metric_int8,
         worst_drop_db=float(np.max([in_float - in_int8 for _, in_float, in_int8 in errors])),
-        input_change=float(np.mean(changes)),
-        contrast=float(np.mean(contrasts)),
+        input_change=float(changes.mean()),
+        contrast=float(contrasts.mean()),
         sample_range=range_from(counts),
-        spread=Spread(
-            dn_counts,
-            np.array([float(np.abs(difference).mean()) for difference in differences]),
-            np.array([float(np.abs(difference).max()) for difference in differences]),
-        ),
+        spread=Spread(dn_counts, maes, largest),
     )
 
 

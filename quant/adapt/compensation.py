@@ -127,7 +127,7 @@ def compensated(
             # Convolutions within an exact replacement have no tensor to be compared with.
             is_known = networks.is_conv(node) and node.result in originals
             weight = networks.graph.value(node, 1)
-            if is_known and weight is not None and np.prod(weight.shape[1:]) <= MOST_UNKNOWNS:
+            if is_known and weight is not None and weight[0].size <= MOST_UNKNOWNS:
                 convolutions.append(node)
     targets = _targets(networks, convolutions)
     for number, (node, target) in enumerate(zip(convolutions, targets, strict=True), 1):
@@ -158,7 +158,7 @@ def _targets(networks: Networks, nodes: Sequence[Node]) -> list[list[Target]]:
     if not nodes:
         return targets
     generator = np.random.default_rng(0)
-    unknowns = [int(np.prod(networks.weights(node)[0].shape[1:])) for node in nodes]
+    unknowns = [networks.weights(node)[0][0].size for node in nodes]
     outputs = [node.result for node in nodes]
     for maps in values_of(networks.original, outputs, networks.images):
         for target, values, count in zip(targets, maps, unknowns, strict=True):
@@ -248,8 +248,7 @@ def _fit(
         return
     kernel, window = kernel_and_window
     groups = node.groups
-    unknowns = int(np.prod(weight.shape[1:]))
-    equations = Equations(groups, unknowns, len(weight) // groups)
+    equations = Equations(groups, weight[0].size, len(weight) // groups)
     names = [node.source, node.result]
     adapted = values_of(networks.adapted, names, networks.images)
     for target, (source, result) in zip(targets, adapted, strict=True):

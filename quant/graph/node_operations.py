@@ -191,12 +191,16 @@ def _read_shuffle(_: OnnxGraph, node: Node) -> Op:
 
 
 READERS: dict[str, Callable[[OnnxGraph, Node], Op]] = {
-    **dict.fromkeys(("AveragePool", "MaxPool"), _read_pool),
+    "AveragePool": _read_pool,
     "Concat": _read_concat,
-    **dict.fromkeys(("Conv", "ConvTranspose"), _read_conv),
+    "Conv": _read_conv,
+    "ConvTranspose": _read_conv,
+    "DepthToSpace": _read_shuffle,
     "GlobalAveragePool": lambda _, node: AveragePool(node.name, node.source, node.result, None),
+    "MaxPool": _read_pool,
     "Resize": _read_resize,
-    **dict.fromkeys(("DepthToSpace", "SpaceToDepth", *MOVES), _read_shuffle),
+    "SpaceToDepth": _read_shuffle,
+    **dict.fromkeys(MOVES, _read_shuffle),
 }
 """Operators that are one operation, independent of the nodes before them."""
 

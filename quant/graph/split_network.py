@@ -147,15 +147,16 @@ def _image_for_convolutions(graph: Graph, channels: int) -> Graph:
     Other operations read it from a convolution that copies it. The image therefore enters in all
     its planes, and its copy among the features has a scale of its own.
     """
-    if all(IMAGE not in op.inputs or (isinstance(op, Conv) and not op.transposed) for op in graph):
-        return graph
-    weight = np.eye(channels, dtype=np.float32)[:, :, None, None]
-    copy = Conv(f"{IMAGE}.copy", IMAGE, f"{IMAGE}.copied", weight, np.zeros(channels, np.float32))
-    others = (
-        op if isinstance(op, Conv) and not op.transposed else renamed(op, {IMAGE: copy.output})
+    copied = f"{IMAGE}.copied"
+    others = tuple(
+        op if isinstance(op, Conv) and not op.transposed else renamed(op, {IMAGE: copied})
         for op in graph
     )
-    return (copy, *others)
+    if not any(copied in op.inputs for op in others):
+        return graph
+    weight = np.eye(channels, dtype=np.float32)[:, :, None, None]
+    bias = np.zeros(channels, np.float32)
+    return (Conv(f"{IMAGE}.copy", IMAGE, copied, weight, bias), *others)
 
 
 def _without_shuffles(graph: Graph) -> tuple[Graph, tuple[Shuffle, ...]]:

@@ -17,7 +17,7 @@ are powers of two.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -132,18 +132,25 @@ class Sample:
     weight: float | Tensor
 
     @classmethod
-    def batch(cls, samples: Sequence["Sample"]) -> "Sample":
-        """Join N samples of equal size to one, whose arrays have N in place of 1, because that runs
-        faster.
+    def batches(cls, samples: Iterable["Sample"]) -> "Iterator[Sample]":
+        """Join samples of one size to one, because that runs faster, with and without references.
+
+        Yields:
+            For N samples of a size one whose arrays have N in place of 1.
         """
-        references = [sample.reference for sample in samples if sample.reference is not None]
-        return cls(
-            np.concatenate([sample.image for sample in samples]),
-            torch.cat([sample.planes for sample in samples]),
-            torch.cat([sample.floats for sample in samples]),
-            torch.cat(references) if references else None,
-            torch.tensor([float(sample.weight) for sample in samples])[:, None, None, None],
-        )
+        batches: dict[tuple[torch.Size, bool], list[Sample]] = {}
+        for sample in samples:
+            kind = sample.planes.shape, sample.reference is None
+            batches.setdefault(kind, []).append(sample)
+        for alike in batches.values():
+            references = [sample.reference for sample in alike if sample.reference is not None]
+            yield cls(
+                np.concatenate([sample.image for sample in alike]),
+                torch.cat([sample.planes for sample in alike]),
+                torch.cat([sample.floats for sample in alike]),
+                torch.cat(references) if references else None,
+                torch.tensor([float(sample.weight) for sample in alike])[:, None, None, None],
+            )
 
     def error(self, correction: Tensor) -> Tensor:
         """Return the weighted error of a computed correction, as a number that autograd can
@@ -271,7 +278,7 @@ def descend(
         rate = highest_rate * pace.share * 0.5 * (1 + math.cos(math.pi * taken / steps))
         trainable.zero_grad()
         drawn = torch.randint(len(samples), (count,), generator=generator).tolist()
-        for batch in _batches([samples[number] for number in drawn]):
+        for batch in Sample.batches(samples[number] for number in drawn):
             share = len(batch.planes) / count
             error = share * batch.error(trainable.activated(batch.planes))
             error.backward()  # type: ignore[no-untyped-call]
@@ -287,15 +294,6 @@ def descend(
             move = mean / (1 - MOMENTUM ** (taken + 1)) / (root + 1e-15)
             parameter.data.sub_(rate * move)
         yield steps - taken - 1
-
-
-def _batches(samples: Sequence[Sample]) -> list[Sample]:
-    """Group samples into batches, one for each size, with and without references."""
-    batches: dict[tuple[torch.Size, bool], list[Sample]] = {}
-    for sample in samples:
-        kind = sample.planes.shape, sample.reference is None
-        batches.setdefault(kind, []).append(sample)
-    return [Sample.batch(alike) for alike in batches.values()]
 
 
 def _averaged(average: Tensor, number: Tensor, count: Tensor | int) -> Tensor:
