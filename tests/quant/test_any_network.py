@@ -52,6 +52,7 @@ def images(name: str, count: int = 3, side: int = SIDE_PX) -> list[np.ndarray]:
     return patches
 
 
+@cache
 def float_network(name: str) -> onnx.ModelProto:
     return simplify(to_onnx(name, build(name, torch.Generator().manual_seed(0))), name)
 

@@ -4,7 +4,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beers_deploy.quant.core import build_core
@@ -76,6 +76,7 @@ def test_tensors_that_factors_cannot_pass_are_left_alone() -> None:
     assert CORRECTION not in singles.tensors
 
 
+@settings(max_examples=50)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 1.0, 3.0]))
 def test_relu6_becomes_the_end_of_int8_for_any_factors(seed: int, size: float) -> None:
     graph = with_relu6(size)

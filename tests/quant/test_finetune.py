@@ -7,9 +7,9 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 from beers_deploy.model.progress import Step, progress, reporting
 from beers_deploy.profiles.errors import ImageError
@@ -66,14 +66,7 @@ def error(core: IntCore, targets: Iterable[tuple[np.ndarray, np.ndarray]]) -> fl
     return float(np.mean(errors))
 
 
-def test_it_begins_with_the_core_s_own_numbers(quantized: Quantized) -> None:
-    """Without a training step, the integers are those of the core."""
-    unchanged = TrainableCore(quantized.core).core()
-    for one, other in zip(quantized.core.convolutions, unchanged.convolutions, strict=True):
-        assert_array_equal(one.weight, other.weight)
-        assert_array_equal(one.bias, other.bias)
-
-
+@settings(max_examples=50)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_odd_operations_equal_the_reference(seed: int) -> None:
     """Training computes odd shapes and scales as the integer reference does.
@@ -165,9 +158,12 @@ def test_it_goes_on_by_itself_while_held_out_pairs_gain(
     none of three paces.
     """
     monkeypatch.setattr("beers_deploy.quant.passes.finetune.ROUNDS", (40, 2, 2, 2))
+    monkeypatch.setattr("beers_deploy.quant.passes.finetune.BATCH_PIXELS", 48**2)
     graph = read_planes(correction_graph(float_onnx))
-    tuning = Tuning(without_references(patches).pairs, None, rate)
-    assert finetune(corrupted(quantized.core), graph, tuning)[1] == steps
+    small = [
+        (image[..., :48, :48], nothing) for image, nothing in without_references(patches).pairs
+    ]
+    assert finetune(corrupted(quantized.core), graph, Tuning(small, None, rate))[1] == steps
 
 
 def test_a_reference_of_another_size_is_refused_in_one_sentence(

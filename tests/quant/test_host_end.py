@@ -1,6 +1,7 @@
 """Tests of what the host computes at a network's end: an activation, and the enlarged image."""
 
 from dataclasses import replace
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -109,6 +110,7 @@ ENDS = {
 }
 
 
+@cache
 def float_network(name: str) -> onnx.ModelProto:
     nodes, _ = ENDS[name]
     ends = "float[N,2,H,W] image => float[N,2,P,Q] restored"

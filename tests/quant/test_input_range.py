@@ -121,7 +121,7 @@ def same_integers(one: IntCore, other: IntCore) -> bool:
     return True
 
 
-@settings(max_examples=15)
+@settings(max_examples=10)
 @given(st.lists(st.integers(-8, 8), min_size=1, max_size=4), st.booleans())
 def test_a_network_of_scaled_channels_has_the_same_integers(
     exponents: list[int], signed: bool
@@ -176,7 +176,7 @@ def test_padding_stays_zero(
     assert_allclose(actual, expected, atol=36 * 1.5 * 30 / (2 * MAX_DN))
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(
     ranges=RANGES,
     adds_image=st.booleans(),

@@ -2,7 +2,7 @@
 
 import onnx
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beers_deploy.profiles.errors import ModelError
@@ -22,6 +22,7 @@ def network() -> onnx.ModelProto:
     return parsed(nodes, ends, constants={"half": 0.5})
 
 
+@settings(max_examples=30)
 @given(st.permutations(range(8)))
 def test_nodes_in_any_order_compute_the_same(order: list[int]) -> None:
     model = network()

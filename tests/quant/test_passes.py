@@ -53,7 +53,7 @@ from beers_deploy.quant.passes.trial import Costs, CropTrials
 from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session
-from tests.quant.quick import image, in_float, quickly, random_conv, run_model
+from tests.quant.quick import image, in_float, patches_of, quickly, random_conv, run_model
 from tests.quant.simplify.networks import parsed
 from tests.quant.test_odd_networks import SAME, sketch
 
@@ -290,7 +290,7 @@ def test_all_passes_lose_far_less_than_none(
 def test_each_step_is_named(float_onnx: onnx.ModelProto, patches: Patches) -> None:
     reported: list[Step] = []
     with reporting(reported.append), progress("calibrating"):
-        quickly(float_onnx, patches)
+        quickly(float_onnx, patches_of(list(patches.degraded)[:2]))
     names = [step.what.removeprefix("calibrating: ") for step in reported]
     named = dict.fromkeys(name.split(" ")[0] for name in names)
     assert [*named] == ["scale", "float", "equalising", "first", "tensors"]
@@ -301,9 +301,10 @@ def test_tensors_next_to_a_group_are_equalised_only_if_that_is_clearly_better(
 ) -> None:
     """ConvBEERS gains next to nothing from it."""
     results = []
+    few = patches_of(list(patches.degraded)[:3])
     for share in (0.85, 0.0, 10.0):
         monkeypatch.setattr("beers_deploy.quant.plan.CLEARLY_LESS", share)
-        results.append(run_model(quickly(float_onnx, patches).host, image(23, 31)))
+        results.append(run_model(quickly(float_onnx, few).host, image(23, 31)))
     usual, never, always = results
     assert_array_equal(usual, never)
     assert (usual != always).any()

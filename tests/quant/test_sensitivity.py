@@ -15,7 +15,7 @@ from beers_deploy.quant.passes.selection import Passes
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.sensitivity import Loss, layer_error_rows, layer_errors, losses
-from beers_deploy.quant.session import few_crops, open_session, result_of, run
+from beers_deploy.quant.session import open_session, result_of, run
 from beers_deploy.studies.stress.faults import with_ops
 from tests.quant.quick import image, patches_of, quickly, without_references
 from tests.quant.simplify.networks import parsed
@@ -96,7 +96,7 @@ def corrupted(quantized: Quantized) -> Quantized:
 
 
 def test_the_loss_is_reported_and_a_large_one_with_its_layer(
-    float_onnx: onnx.ModelProto, corrupted: Quantized, patches: Patches
+    float_onnx: onnx.ModelProto, corrupted: Quantized, patches: Patches, crops: list[np.ndarray]
 ) -> None:
     """The sentence about the loss names the layer that errs most if the loss is large.
 
@@ -112,10 +112,9 @@ def test_the_loss_is_reported_and_a_large_one_with_its_layer(
     better = replace(slight, psnr_int8_db=40.2)
     assert losses(corrupted, better, patches).startswith("INT8 gains 0.20 dB against 40.00 dB")
     strong = replace(slight, psnr_int8_db=39.6)
-    much = losses(corrupted, strong, patches)
-    layers, _ = layer_errors(
-        corrupted.graph, corrupted.core, few_crops(patches.degraded, corrupted.host)
-    )
+    few = patches_of(crops)
+    much = losses(corrupted, strong, few)
+    layers, _ = layer_errors(corrupted.graph, corrupted.core, crops)
     worst = max(layers, key=lambda layer: layer.network.squared)
     assert f": most of it in {worst.name} (" in much
     assert much.endswith("; try `finetune` auto")
@@ -124,7 +123,7 @@ def test_the_loss_is_reported_and_a_large_one_with_its_layer(
     assert losses(corrupted, without, without_references(patches)).endswith("patches of 128 x 128)")
     tuned = replace(corrupted, host=host_model(corrupted.core, {"finetune": "3 steps"}))
     drop = replace(gate, psnr_float_db=40.0, psnr_int8_db=39.6)
-    assert losses(tuned, drop, patches).endswith(" %)")
+    assert losses(tuned, drop, few).endswith(" %)")
 
 
 def test_a_corrupted_layer_is_found(corrupted: Quantized, crops: list[np.ndarray]) -> None:

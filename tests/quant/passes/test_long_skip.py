@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import onnx
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -51,6 +51,7 @@ def run(graph: Graph, names: list[str], channels: int = 1) -> list[np.ndarray]:
     return list(session.run(None, {PLANES: planes.astype(np.float32)}))
 
 
+@settings(max_examples=50)
 @given(
     seed=st.integers(0, 2**32 - 1),
     channels=st.integers(1, 4),
