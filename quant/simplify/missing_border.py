@@ -14,7 +14,7 @@ from copy import deepcopy
 import numpy as np
 from onnx import ModelProto, shape_inference
 
-from beers_deploy.quant.onnx.graph import OnnxGraph
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.messages import sizes_of
 
 WINDOWS = {"AveragePool", "Conv", "MaxPool"}
@@ -38,13 +38,10 @@ def with_missing_border(model: ModelProto) -> ModelProto:
     Returns:
         The network with a Pad in front; `model` itself if no border is missing.
     """
-    nodes = OnnxGraph(model).nodes
+    graph = OnnxGraph(model)
     # Zeros that a layer pads with would lie beyond the mirrored border, not at the image's.
-    is_padded = any(
-        node.op_type == "Pad" or (node.op_type in WINDOWS and any(node.attribute("pads", ())))
-        for node in nodes
-    )
-    reads_all = any(node.op_type.startswith(WHOLE_IMAGE) for node in nodes)
+    is_padded = any(node.op_type == "Pad" or _pads(graph, node) for node in graph.nodes)
+    reads_all = any(node.op_type.startswith(WHOLE_IMAGE) for node in graph.nodes)
     border_px = 0 if is_padded or reads_all else _missing_px(model)
     if not border_px:
         return model
@@ -62,6 +59,15 @@ def with_missing_border(model: ModelProto) -> ModelProto:
     graph.set_nodes([graph.mirrored(image, border_px, mirrored), *graph.nodes])
     graph.save()
     return network
+
+
+def _pads(graph: OnnxGraph, node: Node) -> bool:
+    """Return True if a convolution or pool adds pixels around its map, also by `auto_pad`."""
+    if node.op_type not in WINDOWS:
+        return False
+    weight = graph.value(node, 1)
+    match = node.window(() if weight is None else weight.shape[2:])
+    return any(node.attribute("pads", ()) if match is None else match[1].pads)
 
 
 def _missing_px(model: ModelProto) -> int:

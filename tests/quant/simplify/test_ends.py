@@ -14,7 +14,7 @@ from onnx.reference import ReferenceEvaluator
 from beers_deploy.quant.graph import read_network, refusal
 from beers_deploy.quant.simplify.simplify import simplify
 from tests.quant.quick import assert_same, fix_sizes, run_model
-from tests.quant.simplify.networks import CHANNELS, CONV, SAME, network_from
+from tests.quant.simplify.networks import CHANNELS, SAME, network_from
 
 IMAGE = np.random.default_rng(4).uniform(0, 1, (1, CHANNELS, 18, 23)).astype(np.float32)
 
@@ -210,9 +210,10 @@ def test_a_network_that_pools_over_the_image_gets_no_border() -> None:
     assert_same(model, short, IMAGE)
 
 
-def test_layers_with_and_without_padding_together_are_refused() -> None:
+@pytest.mark.parametrize("pads", ["pads=[1,1,1,1]", 'auto_pad="SAME_UPPER"'])
+def test_layers_with_and_without_padding_together_are_refused(pads: str) -> None:
     """Zeros that a layer pads with would lie beyond a mirrored border."""
-    model = network_from(f"{CONV} y = Conv(c, w)")
+    model = network_from(f"c = Conv<{pads}>(x, w) y = Conv(c, w)")
     short = simplify(model, "a.onnx")
     assert [n.op_type for n in short.graph.node] == ["Conv", "Conv"]
     reason = refusal(short)
