@@ -6,6 +6,7 @@ from onnx import helper
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.instrument import MAX_DN
+from beers_deploy.quant.adapt.kinds import nodes_by_kind
 from beers_deploy.quant.graph import (
     CORRECTION,
     IMAGE,
@@ -13,14 +14,16 @@ from beers_deploy.quant.graph import (
     STEP,
     Add,
     Conv,
+    Pointwise,
     Resize,
     correction_graph,
     read_network,
     same,
 )
 from beers_deploy.quant.host_part import IMAGE_SLICES
+from beers_deploy.quant.onnx.graph import OnnxGraph
 from beers_deploy.quant.onnx.image_input import require_image
-from tests.quant.quick import behind_conv, copied, run_model, uniform
+from tests.quant.quick import behind_conv, run_model, uniform
 from tests.quant.simplify.networks import parsed
 
 
@@ -60,19 +63,23 @@ def test_other_operators_are_refused_by_name(kind: str) -> None:
         correction_graph(model)
 
 
-def test_a_network_without_a_global_add_is_refused(float_onnx: onnx.ModelProto) -> None:
-    model = copied(float_onnx)
-    model.graph.node.pop()
-    model.graph.output[0].name = "tail"
-    with pytest.raises(ModelError, match="global add"):
-        correction_graph(model)
+@pytest.mark.parametrize(
+    ("nodes", "message"),
+    [
+        ("restored = Conv(x, two)", "global add"),
+        ("y = Conv<strides=[2,2]>(x, two) restored = Add(y, image)", "needs tensors of one size"),
+    ],
+)
+def test_networks_of_other_kinds_are_refused(nodes: str, message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        correction_graph(behind_conv(nodes, two=np.ones((1, 2, 1, 1))))
 
 
-def test_a_strided_convolution_is_refused(float_onnx: onnx.ModelProto) -> None:
-    model = copied(float_onnx)
-    model.graph.node[0].attribute.append(helper.make_attribute("strides", [2, 2]))
-    with pytest.raises(ModelError, match="needs tensors of one size"):
-        correction_graph(model)
+def test_a_rounded_slope_of_hard_sigmoid_is_the_dpus() -> None:
+    """A network is read as it is where `adapt` finds nothing to replace."""
+    model = behind_conv("restored = HardSigmoid<alpha=0.16667, beta=0.50002>(x)")
+    assert nodes_by_kind(OnnxGraph(model)) == {}
+    assert isinstance(read_network(model).graph[-1], Pointwise)
 
 
 @pytest.mark.parametrize("kind", ["Add", "Sub", "Mul"])

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import onnx
 import pytest
 from onnx import helper
@@ -14,7 +13,7 @@ from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import load_onnx, read_onnx
-from beers_deploy.quant.session import open_session, tensors_of
+from tests.quant.quick import assert_same, uniform
 from tests.quant.simplify.networks import CONV, NORMAL, network_from
 
 LIGHT = sorted((Path(onnx.__file__).parent / "backend" / "test" / "data" / "light").glob("*.onnx"))
@@ -70,20 +69,13 @@ def test_any_batch_is_read(batch: str | int, tmp_path: Path) -> None:
     short = load_onnx(saved(model, tmp_path))
     assert short.graph.input[0].type.tensor_type.shape.dim[0] == first
     count = 2 if isinstance(batch, str) else batch
-    image = np.random.default_rng(1).random((count, 4, 5, 7)).astype(np.float32)
-    before, after = (
-        tensors_of(open_session(network, 1), None, image)[0] for network in (model, short)
-    )
-    np.testing.assert_allclose(after, before, rtol=1e-5, atol=1e-5)
+    assert_same(model, short, uniform(count, 4, 5, 7), rtol=1e-5, atol=1e-5)
 
 
 def test_a_result_may_have_no_sizes(tmp_path: Path) -> None:
     model = network_from(f"{CONV} y = Relu(c)")
     model.graph.output[0].type.tensor_type.ClearField("shape")
-    image = np.random.default_rng(1).random((1, 4, 5, 7)).astype(np.float32)
-    networks = model, load_onnx(saved(model, tmp_path))
-    before, after = (tensors_of(open_session(each, 1), None, image)[0] for each in networks)
-    np.testing.assert_array_equal(after, before)
+    assert_same(model, load_onnx(saved(model, tmp_path)), uniform(1, 4, 5, 7))
 
 
 def test_check_and_quantize_refuse_a_file_that_cannot_be_simplified(tmp_path: Path) -> None:
