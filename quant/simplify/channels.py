@@ -200,25 +200,17 @@ def repeat_channels(graph: OnnxGraph, node: Node) -> Replacement:
             return None
         weight = np.tile(np.eye(channels), (int(repeats[1]), 1))[:, :, None, None]
         return [graph.convolution(source, result, node.name, weight)]
-    narrow = _narrow_input(graph, node)
-    if narrow is None:
-        return None
-    channels = max(graph.channels(name) for name in node.inputs)
-    name = f"{result}.repeated"
-    repeated = graph.convolution(narrow, name, name, np.ones((channels, 1, 1, 1)))
-    node.read_instead(narrow, name)
-    return [repeated, node]
-
-
-def _narrow_input(graph: OnnxGraph, node: Node) -> str | None:
-    """Return the map of one channel that an Add, Mul or Sub repeats; None if there is none."""
     is_of_maps = graph.constants.keys().isdisjoint(node.inputs)
     if node.op_type not in ("Add", "Mul", "Sub") or not is_of_maps:
         return None
     widths = [graph.channels(name) for name in node.inputs]
     narrow = node.inputs[int(widths[0] > widths[1])]
-    result = node.result
     readers = {reader.op_type for reader in graph.readers[result]}
     is_end = node.op_type == "Add" and (result in graph.outputs or readers <= HOST)
-    is_repeated = min(widths) == 1 < max(widths) and not (is_end and narrow in graph.inputs)
-    return narrow if is_repeated else None
+    channels = max(widths)
+    if not min(widths) == 1 < channels or (is_end and narrow in graph.inputs):
+        return None
+    name = f"{result}.repeated"
+    repeated = graph.convolution(narrow, name, name, np.ones((channels, 1, 1, 1)))
+    node.read_instead(narrow, name)
+    return [repeated, node]
