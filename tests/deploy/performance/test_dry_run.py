@@ -3,6 +3,7 @@
 import math
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,7 +48,7 @@ def about(
     ("tags", "system"), [(TAGS, "EPSG:32631"), (TAGS[:2] + TAGS[3:], "no coordinate system")]
 )
 def test_it_shows_the_facts_of_the_header(
-    tags: list[tuple[object, ...]], system: str, model: Path, tmp_path: Path
+    tags: Any, system: str, model: Path, tmp_path: Path
 ) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.ones((90, 70), np.uint16), extratags=tags)
     row = about(tmp_path / "in.tif", model, 23)

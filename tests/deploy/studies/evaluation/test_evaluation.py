@@ -85,8 +85,9 @@ def test_no_pair_at_all_is_refused() -> None:
 @pytest.mark.parametrize("number", [0.0, 12.5, float("nan"), "x"])
 @pytest.mark.parametrize(("option", "most"), [("brightness", 1), ("bits_per_pixel", 12)])
 def test_a_number_out_of_range_is_refused(number: Any, option: str, most: int) -> None:
+    numbers: Any = {option: (1, number)}
     with pytest.raises(OptionError, match=f"`{option}` .* above 0 and at most {most},"):
-        evaluate(methods=["wiener"], **{option: (1, number)})
+        evaluate(methods=["wiener"], **numbers)
 
 
 def test_a_number_that_is_given_twice_counts_once() -> None:
