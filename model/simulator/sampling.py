@@ -138,6 +138,9 @@ def scene_of(name: str, pixels: np.ndarray, sensor: Instrument) -> Scene:
 
     Warns if more than half of the scene is brighter than the sensor's full scale, as counts of
     another scale are: such a scene is saturated.
+
+    Raises:
+        ImageError: pixels of another kind, or without a value.
     """
     radiance: np.ndarray
     if pixels.dtype == np.uint8:
@@ -152,6 +155,8 @@ def scene_of(name: str, pixels: np.ndarray, sensor: Instrument) -> Scene:
         radiance = pixels.astype(np.float32) / np.float32(sensor.gain_dn_per_radiance)
     elif pixels.ndim == 2 and np.issubdtype(pixels.dtype, np.floating):
         radiance = pixels.astype(np.float32)
+        if not np.isfinite(radiance).all():
+            raise ImageError(f"{name} has pixels that are NaN or infinite. Crop them off.")
     else:
         raise ImageError(
             f"{name} must have 8-bit RGB or mono, 16-bit mono, or float mono pixels, but it has "

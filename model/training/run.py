@@ -239,7 +239,10 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
     synthetic = draw_scenes(run.drawn, recipe.seed) + draw_charts(run.charts, recipe.seed)
     train_on = [scenes[number] for number in training] + synthetic
     if not train_on:
-        raise OptionError("There is nothing to train on. Give `images`, `pairs` or `drawn`.")
+        raise OptionError(
+            "No image is left to train on. Give `images`, `pairs` or `drawn`, or hold out fewer "
+            "sites."
+        )
     patches = PatchSource(train_on, run.patches, recipe.batch, recipe.seed, *ranks, trainer.device)
     if patches.unused and worker.first:
         logger.warning(

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 
 from beers_deploy.model.simulator.mtf import mtf, smear_response, transfer_function
 from beers_deploy.model.simulator.sampling import resample, sample, scene_of, scene_spectrum
+from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Sensor
 from tests.model.simulator import stages
 
@@ -67,6 +68,14 @@ def test_counts_of_another_scale_are_warned_about(
     with caplog.at_level(logging.WARNING):
         scene_of("counts.tif", counts, Sensor.load("pleiades-reference").nominal())
     assert ("counts.tif: 100 % of its pixels" in caplog.text) == (factor > 1)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_scene_with_a_pixel_without_a_value_is_refused(value: float) -> None:
+    pixels = scene(9, 7)
+    pixels[8, 3] = value
+    with pytest.raises(ImageError, match="a has pixels that are NaN or infinite"):
+        scene_of("a", pixels, Sensor.load("pleiades-reference").nominal())
 
 
 def test_a_stack_of_scenes_is_sampled_one_by_one() -> None:
