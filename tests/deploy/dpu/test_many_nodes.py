@@ -101,6 +101,7 @@ def steps(path: Path) -> int:
     return count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_steps_grow_with_the_nodes(
     kind: Callable[[IntegerSketch, str], str], tmp_path: Path
