@@ -116,7 +116,7 @@ def test_the_manifest_records_the_origin_of_each_patch(scene: Path, dataset: Pat
 
 @pytest.mark.slow
 def test_a_killed_dataset_is_resumed_to_the_same_bytes(scene: Path, tmp_path: Path) -> None:
-    options = f"--images {scene} --oversampling 2 --patch 8 --workers 1".split()
+    options = f"--images {scene} --oversampling 2 --patch 12 --workers 1".split()
     unbroken, killed = (tmp_path / name for name in ("whole", "killed"))
     command = [sys.executable, "-m", "beers_deploy", "simulate", *options, "--out"]
     subprocess.run([*command, str(unbroken)], check=True, capture_output=True)
