@@ -129,15 +129,15 @@ class TraditionalRestoration(Restoration):
         stop = top + dn.shape[1]
         missing = np.isnan(dn)
         factors = np.array([self._to_dn(band) for band in range(raster.bands)], np.float32)
-        restored = np.nan_to_num(dn) / factors[:, None, None]
-        pixels = as_stored(raster, restored, full_scale)
+        values = rounded(raster, dn / factors[:, None, None])
+        pixels = as_stored(raster, values, full_scale)
         raw = np.ma.getdata(self.source.read(top, stop))
         valid = ~missing if missing.any() else None
         if valid is not None:
             pixels = np.where(missing, raw.astype(raster.out_dtype), pixels)
         tally = Tally.of(
             np.nan_to_num(raw.astype(np.float64)) / full_scale,
-            rounded(raster, restored).astype(np.float64) / full_scale,
+            values.astype(np.float64) / full_scale,
             valid,
             valid,
         )

@@ -135,8 +135,10 @@ def _is_gate(graph: OnnxGraph, node: Node, source: str) -> bool:
     before = graph.writer(node.source)
     if node.op_type == "Tanh":
         return before.op_type == "Softplus" and before.source == source
-    if node.op_type != "Sigmoid" or node.source == source:
-        return node.op_type == "Sigmoid"
+    if node.op_type != "Sigmoid":
+        return False
+    if node.source == source:
+        return True
     if before.op_type != "Mul" or source not in before.inputs:
         return False
     factor = before.inputs[1 - before.inputs.index(source)]

@@ -128,18 +128,18 @@ def _read_concat(graph: OnnxGraph, node: Node) -> Op:
     return Concat(node.name, node.inputs, node.result)
 
 
-def _read_pool(_: OnnxGraph, node: Node) -> Op:
+def _read_max_pool(_: OnnxGraph, node: Node) -> Op:
+    is_plain = len(node.outputs) == 1 and not node.attribute("ceil_mode")
+    require(is_plain, node, "must have one output and ceil_mode 0")
+    return MaxPool(node.name, node.source, node.result, *_window(node))
+
+
+def _read_average_pool(_: OnnxGraph, node: Node) -> Op:
     kernel, window = _window(node)
-    kind: type[MaxPool | AveragePool] = MaxPool
-    rule = "one output"
-    is_plain = len(node.outputs) == 1
-    if node.op_type == "AveragePool":
-        kind = AveragePool
-        rule = "count_include_pad 1"
-        is_plain = bool(node.attribute("count_include_pad")) or not any(window.pads)
-    is_plain = is_plain and not node.attribute("ceil_mode")
-    require(is_plain, node, f"must have {rule} and ceil_mode 0")
-    return kind(node.name, node.source, node.result, kernel, window)
+    counts_zeros = bool(node.attribute("count_include_pad")) or not any(window.pads)
+    is_plain = counts_zeros and not node.attribute("ceil_mode")
+    require(is_plain, node, "must have count_include_pad 1 and ceil_mode 0")
+    return AveragePool(node.name, node.source, node.result, kernel, window)
 
 
 def _read_resize(graph: OnnxGraph, node: Node) -> Op:
@@ -191,13 +191,13 @@ def _read_shuffle(_: OnnxGraph, node: Node) -> Op:
 
 
 READERS: dict[str, Callable[[OnnxGraph, Node], Op]] = {
-    "AveragePool": _read_pool,
+    "AveragePool": _read_average_pool,
     "Concat": _read_concat,
     "Conv": _read_conv,
     "ConvTranspose": _read_conv,
     "DepthToSpace": _read_shuffle,
     "GlobalAveragePool": lambda _, node: AveragePool(node.name, node.source, node.result, None),
-    "MaxPool": _read_pool,
+    "MaxPool": _read_max_pool,
     "Resize": _read_resize,
     "SpaceToDepth": _read_shuffle,
     **dict.fromkeys(MOVES, _read_shuffle),

@@ -19,6 +19,7 @@ from beers_deploy.profiles.errors import ImageError
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Plan, Span, TilePlace
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
+from beers_deploy.restoration.tiles.missing_pixels import fill_from_nearest
 
 NAME = "The image"
 """The name of an image that has no file, in messages."""
@@ -171,27 +172,28 @@ class Restorer:
         valid = None if missing is None else ~missing
         raw_shares = raw.astype(np.float64) / self.full_scale
 
-        def tally_of(pixels: np.ndarray) -> Tally:
-            known = rounded(self.raster, np.nan_to_num(pixels))
-            shares = known.astype(np.float64) / self.full_scale
+        def tally_of(values: np.ndarray) -> Tally:
+            shares = values.astype(np.float64) / self.full_scale
             return Tally.of(raw_shares, shares, valid_raw, valid)
 
-        pixels = network_pixels = restored[:, down, across]
-        tally = tally_of(network_pixels)
+        network_pixels = restored[:, down, across]
+        values = rounded(self.raster, network_pixels)
+        tally = tally_of(values)
         if self.consistency:
             change = self._change(strip, restored, at, place)
             pixels = np.clip(network_pixels + change, 0, np.float32(self.full_scale))
             squares = np.square((pixels - network_pixels) / self.full_scale)
             squared = float(np.nansum(squares, dtype=np.float64))
+            values = rounded(self.raster, pixels)
             # Doubts about a result refer to the network's output, before this step.
             tally = replace(
-                tally_of(pixels),
+                tally_of(values),
                 change_squared=squared,
                 network_at_ends=tally.at_ends,
                 network_after=tally.after,
                 network_after_squared=tally.after_squared,
             )
-        result = as_stored(self.raster, np.nan_to_num(pixels), self.full_scale)
+        result = as_stored(self.raster, values, self.full_scale)
         if missing is not None:
             result = np.where(missing, self._unrestored(raw, missing), result)
         return Tile(result, tally)
@@ -338,22 +340,25 @@ def checked_strip(
 
 
 def rounded(raster: Raster, restored: np.ndarray) -> np.ndarray:
-    """Return restored pixels as whole numbers, unless the output stores floats."""
-    return restored if raster.out_dtype.kind == "f" else np.rint(restored)
+    """Return restored pixels as whole numbers, unless the output stores floats. Missing ones, which
+    are NaN, become 0.
+    """
+    values = np.asarray(np.nan_to_num(restored))
+    return values if raster.out_dtype.kind == "f" else np.rint(values)
 
 
-def as_stored(raster: Raster, restored: np.ndarray, full_scale: float) -> np.ndarray:
-    """Convert restored pixels to the type of the output, rounded if that is an integer type.
+def as_stored(raster: Raster, values: np.ndarray, full_scale: float) -> np.ndarray:
+    """Convert restored pixels to the type of the output.
 
     A restored pixel that equals the nodata value would read as missing, so it gets the adjacent
     number.
 
     Args:
         raster: the description of the image, which states the output's type and the nodata value.
-        restored: float pixels of any shape, between 0 and full scale.
+        values: pixels of any shape as `rounded` returns them, between 0 and full scale.
         full_scale: the pixel value that is full scale.
     """
-    result = rounded(raster, restored).astype(raster.out_dtype)
+    result = values.astype(raster.out_dtype)
     nodata = raster.nodata
     # A restored pixel lies between 0 and full scale, so another nodata value is never hit.
     if nodata is not None and 0 <= nodata <= full_scale:
@@ -364,38 +369,3 @@ def as_stored(raster: Raster, restored: np.ndarray, full_scale: float) -> np.nda
             adjacent = float(np.nextafter(np.float32(nodata), np.float32(towards)))
         result[result == result.dtype.type(nodata)] = adjacent
     return result
-
-
-def fill_from_nearest(pixels: np.ndarray, missing: np.ndarray, reach_px: int) -> np.ndarray:
-    """Fill missing pixels of one band with copies of known pixels nearby.
-
-    A missing pixel gets the value of the nearest known pixel of its row, else that of the nearest
-    pixel of its column which is known or was filled along its row, else 0. A filled pixel therefore
-    depends on nothing farther away than `reach_px`, and a window gives exactly the same result as
-    the whole image.
-
-    Args:
-        pixels: (h, w) values.
-        missing: mask of the missing pixels, bool (h, w).
-        reach_px: the largest distance, in rows and in columns, of the pixel that is copied.
-    """
-    filled, missing = _along_rows(pixels, missing, reach_px)
-    filled, missing = _along_rows(filled.T, missing.T, reach_px)
-    return np.asarray(np.where(missing, 0, filled).T)
-
-
-def _along_rows(
-    pixels: np.ndarray, missing: np.ndarray, reach_px: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the filled pixels, and a mask of those without a known pixel in reach. Of two at the
-    same distance the left one is used.
-    """
-    width = pixels.shape[1]
-    # If there is no known pixel on one side, its place is out of reach of every pixel.
-    far = width + reach_px + 1
-    here = np.arange(width)
-    left = np.maximum.accumulate(np.where(missing, -far, here), axis=1)
-    right = np.minimum.accumulate(np.where(missing, 2 * far, here)[:, ::-1], axis=1)[:, ::-1]
-    nearest = np.where(here - left <= right - here, left, right)
-    out_of_reach = np.abs(nearest - here) > reach_px
-    return np.take_along_axis(pixels, np.where(out_of_reach, here, nearest), axis=1), out_of_reach
