@@ -187,6 +187,7 @@ EXTRAS = {
     "matplotlib": "study",
     "openvino": "openvino",
     "pandas": "notebook",
+    "pycocotools": "study",
     "pystac": "stac",
     "skimage": "study",
     "torch": "torch",

@@ -29,14 +29,10 @@ from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import REFERENCE
 from beers_deploy.quant.onnx_file import save_onnx
-from beers_deploy.studies.detection.average_precision import (
-    find_hits,
-    interval,
-    score,
-    site_weights,
-)
+from beers_deploy.studies.detection.average_precision import interval, score, site_weights
 from beers_deploy.studies.detection.boxes import Boxes
 from beers_deploy.studies.detection.detector import open_detector
+from beers_deploy.studies.detection.matching import find_hits
 from benchmarks.detector.network import (
     DETECTOR,
     STRIDE_PX,

@@ -50,7 +50,7 @@ def test_commands_without_a_sensor_use_the_same_one() -> None:
     assert set(defaults.values()) == {SENSOR, None}
 
 
-OPTIONAL = {"torch", "dask", "distributed", "xarray", "matplotlib", "skimage"}
+OPTIONAL = {"torch", "dask", "distributed", "xarray", "matplotlib", "pycocotools", "skimage"}
 CALL = "from beers_deploy.cli.commands import app; app({}, standalone_mode=False)"
 
 

@@ -364,7 +364,7 @@ import sys
 
 class Blocked:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in ("torch", "matplotlib", "skimage", "pandas"):
+        if name.split(".")[0] in ("torch", "matplotlib", "pycocotools", "skimage", "pandas"):
             raise ModuleNotFoundError("blocked", name=name)
 
 

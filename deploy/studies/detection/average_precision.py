@@ -1,39 +1,26 @@
 """Average precision, precision and recall, by class and by size, with a bootstrap over sites.
 
-Boxes are matched once, in pixels of the scene. Every figure is then a weighted sum over images.
-With weights of 1 the average precision is that of pycocotools, the reference code of the COCO
-evaluation. With the counts of a bootstrap draw it is that of the images drawn (Everingham et al.,
-IJCV 111, 2015, section 3.5). A mean average precision is not a mean over images, so each draw is
-scored again.
+Every figure is a weighted sum over images of what `matching` found. With weights of 1 the average
+precision is that of pycocotools. With the counts of a bootstrap draw it is that of the images drawn
+(Everingham et al., IJCV 111, 2015, section 3.5). A mean average precision is not a mean over
+images, so each draw is scored again.
 """
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csr_array
 
 from beers_deploy.model.metrics.statistics import LEAST_SITES, percentiles, too_few
 from beers_deploy.profiles.errors import counted
-from beers_deploy.studies.detection.boxes import Boxes, areas, iou
+from beers_deploy.studies.detection.matching import ALL, OVERLAPS, SIZES_PX, Hits
 
-OVERLAPS = np.linspace(0.5, 0.95, 10)
-"""Intersection over union from which a box counts as found: ten levels, as in COCO."""
 RECALLS = np.linspace(0.0, 1.0, 101)
 """The recalls at which COCO samples precision, to average it."""
 CONFIDENCES = np.linspace(0.0, 1.0, 1001)
 """The confidences at which precision and recall are sampled. A detection counts at confidences up
 to its score.
 """
-SIZES_PX = {
-    "all": (0.0, math.inf),
-    "under 16 px": (0.0, 16.0),
-    "16 to 32 px": (16.0, 32.0),
-    "32 px up": (32.0, math.inf),
-}
-"""Square root of a box's area, in px of the scene: from the first value to below the second."""
-ALL = 0
 DRAWS = 1000
 FEW_SITES = 10
 """With fewer sites the percentiles of a bootstrap are too narrow to be trusted, and a note reports
@@ -44,102 +31,6 @@ Figures = Mapping[str, np.ndarray]
 """The figures of a row by name, (1 + draws,) each: on all images, then on each draw. They are NaN
 if there is no object.
 """
-
-
-@dataclass(frozen=True)
-class Hits:
-    """The D detections of one detector on I images, and which of them found an object.
-
-    Results depend on the range of object sizes (S ranges, `SIZES_PX`) and on the overlap that is
-    required (`OVERLAPS`, 10 of them).
-
-    Attributes:
-        images: the index of the image of each detection, (D,) int64.
-        classes: the index of the class of each detection, (D,) int64.
-        scores: the confidence of each detection, (D,) float64, in descending order.
-        hits: True if the detection found an object, (S, 10, D) bool.
-        ignored: True if the detection counts neither as a hit nor as false, (S, 10, D) bool.
-        objects: the number of objects to find, by size, class and image, (S, C, I) int64.
-    """
-
-    images: np.ndarray
-    classes: np.ndarray
-    scores: np.ndarray
-    hits: np.ndarray
-    ignored: np.ndarray
-    objects: np.ndarray
-
-
-def find_hits(truths: Sequence[Boxes], detected: Sequence[Boxes], classes: int) -> Hits:
-    """Match detections with labels, once for all figures, by the rules of the COCO evaluation.
-
-    The detection with the best score is matched first, with the free object of its class that it
-    overlaps most. Detections in an ignored box count neither as hits nor as false. The same holds
-    for objects of another size, and for detections of another size that found none. Every
-    detection counts, while COCO uses the best 100 of a class, because aerial images contain more
-    objects than photographs do.
-
-    Args:
-        truths: the labelled boxes of each image. Images without an object are included, because
-            detections there are false.
-        detected: the detections on each image, in the pixels and classes of its labelled boxes.
-        classes: the number of classes.
-    """
-    scores = np.concatenate([boxes.scores for boxes in detected])
-    kinds = np.concatenate([boxes.classes for boxes in detected])
-    # Stable, so that equal scores keep the order of the images.
-    order = np.argsort(-scores, kind="stable")
-    image = np.repeat(np.arange(len(detected)), [len(boxes) for boxes in detected])
-    matches = [match(truth, boxes)[:2] for truth, boxes in zip(truths, detected, strict=True)]
-    hits, ignored = (
-        np.concatenate(parts, axis=-1)[..., order] for parts in zip(*matches, strict=True)
-    )
-    counts = [
-        [
-            np.bincount(truth.classes[~uncounted], minlength=classes)
-            for uncounted in truth.ignored | _of_other_size(truth)
-        ]
-        for truth in truths
-    ]
-    return Hits(image[order], kinds[order], scores[order], hits, ignored, np.stack(counts, axis=-1))
-
-
-def _of_other_size(boxes: Boxes) -> np.ndarray:
-    sides = np.sqrt(areas(boxes.corners))
-    return np.array([(sides < low) | (sides >= high) for low, high in SIZES_PX.values()])
-
-
-def match(truth: Boxes, detected: Boxes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Match the detections on one image with its labelled objects, as `find_hits` describes.
-
-    Args:
-        truth: the M labelled boxes of the image.
-        detected: the N detections on the image.
-
-    Returns:
-        Three masks for each of S size ranges and 10 overlaps: of the detections that are hits, of
-        those that are ignored, both (S, 10, N), and of the objects that were found, (S, 10, M).
-    """
-    uncounted = np.repeat((truth.ignored | _of_other_size(truth))[:, None], len(OVERLAPS), axis=1)
-    ignored = np.repeat(_of_other_size(detected)[:, None], len(OVERLAPS), axis=1)
-    hits = np.zeros_like(ignored)
-    matched = np.zeros_like(uncounted)
-    overlaps = iou(detected.corners, truth.corners, truth.ignored) * (
-        detected.classes[:, None] == truth.classes
-    )
-    for one in np.argsort(-detected.scores, kind="stable"):
-        if overlaps[one].max(initial=0) < OVERLAPS[0]:
-            continue
-        # An object is found once; an ignored box may hold any number of detections.
-        free = (overlaps[one] >= OVERLAPS[:, None]) & ~(matched & ~truth.ignored)
-        at = np.nonzero(free.any(axis=-1))
-        # Objects that count take precedence: 1 is added to their overlap, which is at most 1.
-        preference = np.where(free, overlaps[one] + ~uncounted, 0.0)
-        best = preference.argmax(axis=-1)[at]
-        hits[*at, one] = ~uncounted[*at, best]
-        ignored[*at, one] = uncounted[*at, best]
-        matched[*at, best] = True
-    return hits, ignored, matched
 
 
 def site_weights(sites: Sequence[str], seed: int) -> np.ndarray:
@@ -299,6 +190,8 @@ def precisions(
     curves = np.full((len(weights), levels, len(RECALLS)), np.nan)
     for level in range(levels):
         counted = np.flatnonzero((hits.classes == kind) & ~hits.ignored[size, level])
+        # Stable, so that equal scores keep the order of the images.
+        counted = counted[np.argsort(-hits.scores[counted], kind="stable")]
         images = hits.images[counted]
         hit = np.flatnonzero(hits.hits[size, level, counted])
         for draw in np.flatnonzero(totals):

@@ -109,14 +109,12 @@ def areas(corners: np.ndarray) -> np.ndarray:
     return np.asarray(np.prod(np.maximum(corners[:, 2:] - corners[:, :2], 0), axis=1))
 
 
-def iou(one: np.ndarray, other: np.ndarray, ignored: np.ndarray | bool = False) -> np.ndarray:
+def iou(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Compute the overlap of each box with each other box: their intersection over union.
 
     Args:
         one: the corners of N boxes, (N, 4).
         other: the corners of M boxes, (M, 4).
-        ignored: True for boxes of `other` that need not be found, (M,). For these the overlap is
-            the share of the box of `one` that lies inside, as COCO has it for crowds.
 
     Returns:
         The overlaps of 0 to 1, (N, M); 0 for two boxes without area.
@@ -124,10 +122,7 @@ def iou(one: np.ndarray, other: np.ndarray, ignored: np.ndarray | bool = False) 
     low = np.maximum(one[:, None, :2], other[None, :, :2])
     high = np.minimum(one[:, None, 2:], other[None, :, 2:])
     shared = np.prod(np.maximum(high - low, 0), axis=2)
-    own = areas(one)[:, None]
-    # For an ignored box, the overlap is the share of the detection inside it, as COCO defines it
-    # for crowds.
-    union = np.where(ignored, own, own + areas(other) - shared)
+    union = areas(one)[:, None] + areas(other) - shared
     return np.asarray(np.divide(shared, union, out=np.zeros_like(shared), where=union > 0))
 
 

@@ -10,8 +10,8 @@ from beers_deploy.model.io.pictures import grid, picture_url
 from beers_deploy.profiles.figures import by_table
 from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.results import Table
-from beers_deploy.studies.detection.average_precision import ALL, match
 from beers_deploy.studies.detection.boxes import Boxes
+from beers_deploy.studies.detection.matching import ALL, find_hits
 from beers_deploy.studies.detection.study import REFERENCE, Comparison
 from beers_deploy.studies.detection.tables import BY_SIZE, MAIN, PAPER_NOTES
 from beers_deploy.studies.evaluation.methods import DEGRADED
@@ -117,10 +117,9 @@ def _matched(
     boxes = comparison.boxes[row][number]
     # The pictures show what the table counts.
     sure = boxes[boxes.scores >= comparison.confidence]
-    hits, ignored, matched = (
-        flags[ALL, 0] for flags in match(comparison.scenes[number].scene.truth, sure)
-    )
-    return sure, hits, ignored, matched
+    truth = comparison.scenes[number].scene.truth
+    hits = find_hits([truth], [sure], len(comparison.names))
+    return sure, hits.hits[ALL, 0], hits.ignored[ALL, 0], hits.found[ALL, 0]
 
 
 def _middle(comparison: Comparison, number: int) -> np.ndarray:

@@ -21,15 +21,11 @@ from beers_deploy.model.simulator.sampling import read_scene
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.reference import reference_for
 from beers_deploy.profiles.sensor import Sensor, SensorLike
-from beers_deploy.studies.detection.average_precision import (
-    Figures,
-    find_hits,
-    score_rows,
-    site_weights,
-)
+from beers_deploy.studies.detection.average_precision import Figures, score_rows, site_weights
 from beers_deploy.studies.detection.boxes import Boxes
 from beers_deploy.studies.detection.detector import Detector, class_numbers
 from beers_deploy.studies.detection.labels import read_labelled
+from beers_deploy.studies.detection.matching import find_hits
 from beers_deploy.studies.evaluation.methods import DEGRADED, Method, method_named
 
 REFERENCE = "reference"

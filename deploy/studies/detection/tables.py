@@ -11,8 +11,9 @@ from beers_deploy.model.metrics.statistics import too_few
 from beers_deploy.profiles.errors import counted
 from beers_deploy.profiles.figures import Figure, Row, measured, published, unavailable
 from beers_deploy.results import Table
-from beers_deploy.studies.detection.average_precision import DRAWS, SIZES_PX, interval, sites_note
+from beers_deploy.studies.detection.average_precision import DRAWS, interval, sites_note
 from beers_deploy.studies.detection.detector import Detector
+from beers_deploy.studies.detection.matching import SIZES_PX
 from beers_deploy.studies.detection.study import REFERENCE, Comparison, LabelledScene
 from beers_deploy.studies.evaluation.methods import DEGRADED
 

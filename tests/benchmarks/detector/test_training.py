@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from beers_deploy.quant.onnx_file import load_onnx, metadata
-from beers_deploy.studies.detection.average_precision import find_hits, map50
+from beers_deploy.studies.detection.average_precision import map50
 from beers_deploy.studies.detection.boxes import Boxes
 from beers_deploy.studies.detection.detector import open_detector
+from beers_deploy.studies.detection.matching import find_hits
 from benchmarks.detector.network import DETECTOR, Decoding, DetectorNetwork, detector_to_onnx
 from benchmarks.detector.scenes import CLASSES
 from benchmarks.detector.training import (

@@ -16,9 +16,6 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
 from beers_deploy.studies.detection.average_precision import (
-    SIZES_PX,
-    Hits,
-    find_hits,
     interval,
     mean_known,
     precisions,
@@ -28,6 +25,7 @@ from beers_deploy.studies.detection.average_precision import (
     sites_note,
 )
 from beers_deploy.studies.detection.boxes import Boxes
+from beers_deploy.studies.detection.matching import SIZES_PX, Hits, find_hits
 
 NAMES = ("ship", "tank", "vehicle")
 SEEDS = st.integers(0, 2**32 - 1)

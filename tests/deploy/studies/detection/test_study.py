@@ -14,9 +14,10 @@ from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.detection import average_precision
-from beers_deploy.studies.detection.average_precision import find_hits, score_rows, site_weights
+from beers_deploy.studies.detection.average_precision import score_rows, site_weights
 from beers_deploy.studies.detection.boxes import Boxes, iou
 from beers_deploy.studies.detection.detector import Detector
+from beers_deploy.studies.detection.matching import find_hits
 from beers_deploy.studies.detection.page import crops
 from beers_deploy.studies.detection.study import (
     REFERENCE,
