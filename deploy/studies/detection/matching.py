@@ -46,7 +46,7 @@ class Hits:
         scores: the confidence of each detection, (D,) float64.
         hits: True if the detection found an object, (S, 10, D) bool.
         ignored: True if the detection counts neither as a hit nor as false, (S, 10, D) bool.
-        found: True if a detection matches the labelled box, (S, 10, M) bool.
+        is_found: True if a detection matches the labelled box, (S, 10, M) bool.
         objects: the number of objects to find, by size, class and image, (S, C, I) int64.
     """
 
@@ -55,7 +55,7 @@ class Hits:
     scores: np.ndarray
     hits: np.ndarray
     ignored: np.ndarray
-    found: np.ndarray
+    is_found: np.ndarray
     objects: np.ndarray
 
 
@@ -84,7 +84,7 @@ def find_hits(truths: Sequence[Boxes], detected: Sequence[Boxes], classes: int) 
     levels = len(ranges), len(OVERLAPS)
     hits = np.zeros((*levels, len(detections.anns)), bool)
     ignored = np.zeros_like(hits)
-    found = np.zeros((*levels, len(labels.anns)), bool)
+    is_found = np.zeros((*levels, len(labels.anns)), bool)
     objects = np.zeros((len(ranges), classes, len(truths)), np.int64)
     # There is one entry for each range, class and image with boxes.
     for entry in filter(None, evaluation.evalImgs):
@@ -93,7 +93,7 @@ def find_hits(truths: Sequence[Boxes], detected: Sequence[Boxes], classes: int) 
         of_labels = np.array(entry["gtIds"], np.int64) - 1
         hits[size][:, of_detections] = (entry["dtMatches"] > 0) & ~entry["dtIgnore"]
         ignored[size][:, of_detections] = entry["dtIgnore"]
-        found[size][:, of_labels] = entry["gtMatches"] > 0
+        is_found[size][:, of_labels] = entry["gtMatches"] > 0
         objects[size, entry["category_id"], entry["image_id"]] = (entry["gtIgnore"] == 0).sum()
     return Hits(
         np.repeat(np.arange(len(detected)), [len(boxes) for boxes in detected]),
@@ -101,7 +101,7 @@ def find_hits(truths: Sequence[Boxes], detected: Sequence[Boxes], classes: int) 
         np.concatenate([boxes.scores for boxes in detected]),
         hits,
         ignored,
-        found,
+        is_found,
         objects,
     )
 

@@ -119,7 +119,7 @@ def _matched(
     sure = boxes[boxes.scores >= comparison.confidence]
     truth = comparison.scenes[number].scene.truth
     hits = find_hits([truth], [sure], len(comparison.names))
-    return sure, hits.hits[ALL, 0], hits.ignored[ALL, 0], hits.found[ALL, 0]
+    return sure, hits.hits[ALL, 0], hits.ignored[ALL, 0], hits.is_found[ALL, 0]
 
 
 def _middle(comparison: Comparison, number: int) -> np.ndarray:
