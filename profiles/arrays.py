@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from beers_deploy.profiles.errors import ImageError, reason_of
-from beers_deploy.profiles.toml import unreadable
+from beers_deploy.profiles.user_files import unreadable
 
 ZIP = b"PK"
 """The first bytes of a ZIP archive, which a truncated archive has too."""

@@ -1,24 +1,15 @@
 """Find and read a profile: a shipped name, or the path of the user's own TOML file."""
 
-import json
-import math
 import re
-import stat
 import tomllib
-from collections import Counter
-from contextlib import suppress
 from pathlib import Path
 
 from beers_deploy.profiles.errors import ProfileError, printable
 from beers_deploy.profiles.shipped import profile_path, shipped_names
+from beers_deploy.profiles.user_files import QUOTED, TOO_DEEP, read_whole
 
 TOML_BYTES = 1 << 16
 """The maximum size of a file, five times the largest shipped profile."""
-JSON_BYTES = 1 << 26
-TOO_DEEP = "too many levels of nesting"
-LFS_POINTER = b"version https://git-lfs"
-QUOTED = 80
-"""The maximum number of characters that a message shows of a line with an error."""
 
 
 def read_toml_text(path: Path) -> dict[str, object]:
@@ -48,101 +39,6 @@ def read_toml_text(path: Path) -> dict[str, object]:
     # Python converts no more than 4300 digits, and its message names a setting of its own.
     except ValueError:
         raise ValueError("a number has too many digits") from None
-
-
-def read_json(path: Path) -> object:
-    """Read a JSON file as plain values of Python.
-
-    Raises:
-        ValueError: the file is too large or no valid JSON; the message is the reason.
-        OSError: the file cannot be opened.
-    """
-    return parse_json(read_whole(path, JSON_BYTES).decode("utf-8-sig"))
-
-
-def parse_json(text: str) -> object:
-    """Parse JSON text from an untrusted source into plain values of Python.
-
-    Raises:
-        ValueError: the text is empty or no valid JSON, has a key twice, or a number that float64
-            cannot hold; the message is the reason.
-    """
-    if not text.strip():
-        raise ValueError("it is an empty file")
-    try:
-        document: object = json.loads(
-            text,
-            parse_constant=_number,
-            parse_float=_number,
-            parse_int=_whole,
-            object_pairs_hook=_unique,
-        )
-        # Half a surrogate pair cannot be printed.
-        json.dumps(document, ensure_ascii=False).encode()
-    except RecursionError:
-        raise ValueError(TOO_DEEP) from None
-    return document
-
-
-def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
-    """Return an object; raise ValueError if it has a key twice, because readers disagree about its
-    value.
-    """
-    members = dict(pairs)
-    if len(members) < len(pairs):
-        twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
-        raise ValueError(f"it has the key {twice[:QUOTED]!r} twice")
-    return members
-
-
-def _number(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(f"the number {text[:20]} is not finite")
-    return value
-
-
-def _whole(text: str) -> int:
-    # It refuses numbers that float64 cannot represent.
-    _number(text)
-    return int(text)
-
-
-def read_whole(path: Path, limit_bytes: int) -> bytes:
-    """Read all bytes of a file that is not larger than expected.
-
-    Raises:
-        ValueError: the path is no regular file, a Git LFS pointer, or larger than `limit_bytes`.
-        OSError: the file does not exist or cannot be opened.
-    """
-    status = path.stat()
-    if reason := unreadable(path):
-        raise ValueError(reason)
-    if status.st_size > limit_bytes:
-        raise ValueError(f"it has more than {limit_bytes} bytes")
-    return path.read_bytes()
-
-
-def unreadable(path: Path) -> str | None:
-    """Return the reason why a path cannot be read as a file, as a phrase for a message, or None if
-    it can be read.
-
-    Git LFS stores a pointer in place of each large file that was not fetched: 130 bytes of text
-    under the name of the file.
-    """
-    try:
-        mode = path.stat().st_mode
-    except FileNotFoundError:
-        return "no such file"
-    # One reason is a name that is too long.
-    except OSError as error:
-        return error.strerror or str(error)
-    if not stat.S_ISREG(mode):
-        return "it is a folder" if stat.S_ISDIR(mode) else "it is not a regular file"
-    with suppress(OSError), path.open("rb") as stream:
-        if stream.read(len(LFS_POINTER)) == LFS_POINTER:
-            return "it is a Git LFS pointer to the file, which 'git lfs pull' fetches"
-    return None
 
 
 def read_toml(kind: str, name: str) -> tuple[str, dict[str, object]]:

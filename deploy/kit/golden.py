@@ -23,9 +23,10 @@ from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.arrays import ALONE, load_arrays
 from beers_deploy.profiles.errors import ImageError, OptionError, printable
 from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.json_text import read_json
 from beers_deploy.profiles.shipped import DEFAULT_TARGET
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.profiles.toml import read_json, unreadable
+from beers_deploy.profiles.user_files import unreadable
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import read_core, require_undamaged
 from beers_deploy.quant.graph import PLANES
