@@ -152,10 +152,11 @@ def read_planes(source: Source, bands: Sequence[int], factor: int) -> Planes:
         stored = source.read(start, stop)[list(bands)]
         # Blocks at the right and at the bottom may have fewer pixels.
         beyond = ((0, 0), (0, (start - stop) % factor), (0, -raster.width_px % factor))
+        missing = raster.missing(stored)
         pixels = np.ma.array(
-            np.pad(np.ma.getdata(stored), beyond),
+            np.pad(np.where(missing, 0, stored), beyond),
             np.float32,
-            mask=np.pad(raster.missing(stored), beyond, constant_values=True),
+            mask=np.pad(missing, beyond, constant_values=True),
         )
         blocks = pixels.reshape(len(bands), pixels.shape[1] // factor, factor, -1, factor)
         parts.append(blocks.mean(axis=(2, 4)).filled(np.nan).astype(np.float32))

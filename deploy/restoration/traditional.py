@@ -102,7 +102,8 @@ class TraditionalRestoration(Restoration):
             # Values above an assumed full scale show that the assumption is wrong.
             clips = not self.scale.assumed
             strip = checked_strip(source.raster, start, stored, self.scale.value, self.name, clips)
-            pixels = np.minimum(strip.pixels[band].astype(np.float32), self.scale.value)
+            # Missing pixels may be beyond float32; no others are below 0.
+            pixels = np.clip(strip.pixels[band], 0, self.scale.value).astype(np.float32)
             dn = pixels * self._to_dn(band)
             if strip.missing is not None:
                 dn[strip.missing[band]] = np.nan
@@ -134,7 +135,7 @@ class TraditionalRestoration(Restoration):
         raw = np.ma.getdata(self.source.read(top, stop))
         valid = ~missing if missing.any() else None
         if valid is not None:
-            pixels = np.where(missing, raw.astype(raster.out_dtype), pixels)
+            pixels = np.where(missing, raster.unrestored(raw), pixels)
         tally = Tally.of(
             np.nan_to_num(raw.astype(np.float64)) / full_scale,
             values.astype(np.float64) / full_scale,

@@ -175,6 +175,13 @@ class Raster:
         """The type of the restored image: float32 for floats, else the type of the pixels."""
         return np.dtype(np.float32) if self.dtype.kind == "f" else self.dtype
 
+    def unrestored(self, pixels: np.ndarray) -> np.ndarray:
+        """Return missing pixels, of any shape, in the type of the restored image; float64 values
+        beyond float32 become infinite.
+        """
+        with np.errstate(over="ignore"):
+            return pixels.astype(self.out_dtype)
+
     @property
     def band_names(self) -> tuple[str, ...]:
         """The names of the bands; empty if any band has none."""
@@ -222,12 +229,14 @@ class Raster:
         """
         bands, height_px, width_px = shape
         alike = bands == self.bands
+        nodata = None if self.nodata is None else float(self.unrestored(np.float64(self.nodata)))
         return replace(
             self,
             bands=bands,
             height_px=height_px,
             width_px=width_px,
             dtype=self.out_dtype,
+            nodata=nodata,
             colour=self.colour and alike,
             place=self.place.enlarged(width_px // self.width_px),
             band_info=self.band_info if alike else (),

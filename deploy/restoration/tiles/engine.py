@@ -208,10 +208,11 @@ class Restorer:
         left = max(columns.keep_start - RAW_REACH_PX, 0)
         down = slice(top - strip.top, rows.keep_stop + RAW_REACH_PX - strip.top)
         across = slice(left - strip.left, columns.keep_stop + RAW_REACH_PX - strip.left)
-        raw = strip.pixels[bands, down, across].astype(np.float32)
+        raw = strip.pixels[bands, down, across]
         if strip.missing is not None:
             # The step gives the blocks of missing pixels a weight of 0, and 0 times NaN is NaN.
-            raw[strip.missing[bands, down, across]] = 0
+            raw = np.where(strip.missing[bands, down, across], 0, raw)
+        raw = raw.astype(np.float32)
         sides = (
             Placed(self.raster.height_px, at[0], rows.keep_start, rows.keep_stop),
             Placed(self.raster.width_px, at[1], columns.keep_start, columns.keep_stop),
@@ -255,12 +256,11 @@ class Restorer:
         """Return the values that missing pixels are stored as: unchanged, or the nodata value if
         bands do not correspond.
         """
-        kind = self.raster.out_dtype
         if self.plan.tiling.channels_in == self.plan.tiling.channels_out:
-            return _enlarged(raw.astype(kind), self.plan.scale)
-        none = np.nan if kind.kind == "f" else 0
+            return _enlarged(self.raster.unrestored(raw), self.plan.scale)
+        none = np.nan if self.raster.out_dtype.kind == "f" else 0
         blank = none if self.raster.nodata is None else self.raster.nodata
-        return np.full(missing.shape, blank, kind)
+        return self.raster.unrestored(np.full(missing.shape, blank))
 
     def _window(self, strip: Strip, place: TilePlace) -> np.ndarray:
         """Return the network's input for a tile, (bands, h, w), with missing pixels filled,

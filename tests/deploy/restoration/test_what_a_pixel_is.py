@@ -73,6 +73,18 @@ def test_a_mask_marks_missing_pixels_and_is_copied(
     assert_array_equal(result_mask == 0, HIDDEN)
 
 
+def test_a_nodata_value_beyond_float32_becomes_infinite(model: Path, tmp_path: Path) -> None:
+    lowest = float(np.finfo(np.float64).min)
+    pixels = pixels_of_test().astype(np.float64)
+    tifffile.imwrite(tmp_path / "nan.tif", np.where(HIDDEN, np.nan, pixels))
+    expected, _ = restored(tmp_path / "nan.tif", model)
+    tifffile.imwrite(tmp_path / "in.tif", np.where(HIDDEN, lowest, pixels), **marked(lowest))
+    result, _ = restored(tmp_path / "in.tif", model, view=tmp_path / "view.html")
+    assert_array_equal(result, np.where(HIDDEN, -np.inf, expected))
+    with tifffile.TiffFile(tmp_path / "out.tif") as file:
+        assert file.pages.first.tags[42113].value == "-inf"
+
+
 def test_sidecar_files_of_gdal_count(model: Path, tmp_path: Path) -> None:
     image = tmp_path / "in.tif"
     auxiliary = tmp_path / "in.tif.aux.xml"
