@@ -24,6 +24,10 @@ from beers_deploy.restoration.tiles.missing_pixels import fill_from_nearest
 NAME = "The image"
 """The name of an image that has no file, in messages."""
 
+NEAR_NODATA = 2**-20
+"""GDAL reads floats within 2**-21 of the nodata value, as a share of it, as missing."""
+SMALLEST = float(np.finfo(np.float32).smallest_subnormal)
+
 Window = tuple[slice, slice, slice]
 """Bands, rows and columns of an array."""
 
@@ -350,8 +354,8 @@ def rounded(raster: Raster, restored: np.ndarray) -> np.ndarray:
 def as_stored(raster: Raster, values: np.ndarray, full_scale: float) -> np.ndarray:
     """Convert restored pixels to the type of the output.
 
-    A restored pixel that equals the nodata value would read as missing, so it gets the adjacent
-    number.
+    A restored pixel that equals the nodata value, or of floats one that nearly does, would read as
+    missing, so it gets an adjacent number.
 
     Args:
         raster: the description of the image, which states the output's type and the nodata value.
@@ -362,10 +366,7 @@ def as_stored(raster: Raster, values: np.ndarray, full_scale: float) -> np.ndarr
     nodata = raster.nodata
     # A restored pixel lies between 0 and full scale, so another nodata value is never hit.
     if nodata is not None and 0 <= nodata <= full_scale:
-        if raster.out_dtype.kind != "f":
-            adjacent = nodata + 1 if nodata + 1 <= full_scale else nodata - 1
-        else:
-            towards = full_scale if nodata < full_scale else 0
-            adjacent = float(np.nextafter(np.float32(nodata), np.float32(towards)))
-        result[result == result.dtype.type(nodata)] = adjacent
+        step = max(nodata * NEAR_NODATA, SMALLEST) if raster.out_dtype.kind == "f" else 1
+        adjacent = nodata + step if nodata + step <= full_scale else nodata - step
+        result[np.abs(values - np.float32(nodata)) < step] = adjacent
     return result

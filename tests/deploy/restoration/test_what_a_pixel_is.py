@@ -85,6 +85,19 @@ def test_a_nodata_value_beyond_float32_becomes_infinite(model: Path, tmp_path: P
         assert file.pages.first.tags[42113].value == "-inf"
 
 
+@pytest.mark.parametrize("nodata", [0.0, 1.0])
+def test_gdal_reads_no_restored_float_as_missing(
+    nodata: float, model: Path, tmp_path: Path
+) -> None:
+    """The network returns many pixels at 0 and at full scale."""
+    shares = np.clip(pixels_of_test() / 4095, 0.01, 0.99).astype(np.float32)
+    tifffile.imwrite(tmp_path / "in.tif", np.where(HIDDEN, nodata, shares), **marked(nodata))
+    result, _ = restored(tmp_path / "in.tif", model, full_scale=1)
+    assert np.isclose(result[~HIDDEN], nodata).mean() > 0.1
+    with warnings.catch_warnings(action="ignore"), rasterio.open(tmp_path / "out.tif") as file:
+        assert_array_equal(file.dataset_mask() == 0, HIDDEN)
+
+
 def test_sidecar_files_of_gdal_count(model: Path, tmp_path: Path) -> None:
     image = tmp_path / "in.tif"
     auxiliary = tmp_path / "in.tif.aux.xml"
