@@ -57,21 +57,25 @@ class Output:
 
 
 def require_tiff_name(path: Path) -> None:
-    """Raise an error if the path of the restored image is not UTF-8 or has no suffix of a TIFF, or
-    if a sidecar file (.msk or .aux.xml) exists already that readers would apply to the new image.
-    """
+    """Raise an error if the path of the restored image is not UTF-8 or has no suffix of a TIFF."""
     require_utf8(path)
     if path.suffix.lower() not in OUT_SUFFIXES:
         raise OptionError(
             f"The output must have the name of a TIFF, such as restored.tif, got {path.name}. "
             "Rename it; other programs convert a TIFF to the format that you need."
         )
-    for ending in (".msk", ".aux.xml"):
+
+
+def require_no_sidecar(path: Path) -> None:
+    """Raise OptionError if a sidecar of an output (a mask, metadata or overviews) exists already,
+    which readers would apply to the new file.
+    """
+    for ending in (".msk", ".aux.xml", ".ovr"):
         sidecar = path.with_name(f"{path.name}{ending}")
         if sidecar.exists():
             raise OptionError(
                 f"The sidecar {sidecar.name} exists already, and readers would apply it to the new "
-                "image. Remove it, or choose another name for the output."
+                "file. Remove it, or choose another name for the output."
             )
 
 

@@ -283,7 +283,7 @@ def _output(
     """
     from beers_deploy.model.io.lock import part_folder
     from beers_deploy.restoration.detectors.fault_list import found_list_path
-    from beers_deploy.restoration.output import Output, require_tiff_name
+    from beers_deploy.restoration.output import Output, require_no_sidecar, require_tiff_name
     from beers_deploy.restoration.stac import network_paths
 
     if out is None:
@@ -303,11 +303,12 @@ def _output(
     listed = found_list_path(path, fix_detectors)
     others = (*named, listed, output.self_check, output.interval_path)
     may_exist = overwrite or (output.resume and part_folder(path).exists())
-    for each in (path, *others):
-        if each is not None and each.exists() and not may_exist:
+    for each in filter(None, (path, *others)):
+        if each.exists() and not may_exist:
             raise OptionError(
                 f"{each} exists already. Add `overwrite` to replace it, or choose another name."
             )
+        require_no_sidecar(each)
     return replace(output, others=others)
 
 
