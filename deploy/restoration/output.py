@@ -67,11 +67,14 @@ def require_tiff_name(path: Path) -> None:
 
 
 def require_no_sidecar(path: Path) -> None:
-    """Raise OptionError if a sidecar of an output (a mask, metadata or overviews) exists already,
-    which readers would apply to the new file.
+    """Raise OptionError if a sidecar of an output (a mask, metadata, overviews or the place on
+    Earth) exists already, which readers would apply to the new file.
     """
-    for ending in (".msk", ".aux.xml", ".ovr"):
-        sidecar = path.with_name(f"{path.name}{ending}")
+    sidecars = [path.with_name(f"{path.name}{ending}") for ending in (".msk", ".aux.xml", ".ovr")]
+    # Documents have no world file: theirs would be that of an image of the same stem.
+    if path.suffix.lower() in OUT_SUFFIXES:
+        sidecars.append(path.with_suffix(".tfw"))
+    for sidecar in sidecars:
         if sidecar.exists():
             raise OptionError(
                 f"The sidecar {sidecar.name} exists already, and readers would apply it to the new "
