@@ -229,7 +229,7 @@ class Raster:
         """
         bands, height_px, width_px = shape
         alike = bands == self.bands
-        nodata = None if self.nodata is None else float(self.unrestored(np.float64(self.nodata)))
+        nodata = None if self.nodata is None else float(self.unrestored(np.array(self.nodata)))
         return replace(
             self,
             bands=bands,
