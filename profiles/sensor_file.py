@@ -178,4 +178,5 @@ def _toml(value: object) -> str:
     entries = vars(value) if isinstance(value, Stated) else value
     if isinstance(entries, dict):
         return "{ " + ", ".join(f"{key} = {_toml(entry)}" for key, entry in entries.items()) + " }"
-    return json.dumps(entries, ensure_ascii=False)
+    # JSON escapes all control characters that TOML forbids, but for DEL.
+    return json.dumps(entries, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -219,7 +219,8 @@ def test_equal_profiles_have_one_hash(kind: type[Sensor] | type[TargetProfile]) 
 
 
 def test_a_sensor_is_saved_into_a_new_folder_or_refused_in_a_sentence(tmp_path: Path) -> None:
-    sensor = Sensor.load("pleiades-degraded")
+    controls = "".join(map(chr, [*range(32), 0x7F, 0x85, 0x2028]))
+    sensor = replace(Sensor.load("pleiades-degraded"), description=f'"\\ {controls}')
     assert Sensor.load(sensor.save(tmp_path / "new" / f"{sensor.name}.toml")) == sensor
     with pytest.raises(MachineError, match="cannot be written"):
         sensor.save(tmp_path)
