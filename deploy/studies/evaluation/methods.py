@@ -111,14 +111,14 @@ METHOD_NAMES = (
 )
 
 
-def network_and_sensor(name: str) -> tuple[str, str]:
-    """Split NETWORK@SENSOR into its two parts, of which the second may be empty. The path of a file
-    may have an @ in it.
+def network_and_sensor(name: str) -> tuple[str, str | None]:
+    """Split NETWORK@SENSOR into its two parts, of which the second is None if there is no @. The
+    path of a file may have an @ in it.
     """
     if Path(name).is_file():
-        return name, ""
-    network, _, sensor = name.partition("@")
-    return network, sensor
+        return name, None
+    network, at, sensor = name.partition("@")
+    return network, sensor if at else None
 
 
 def method_named(name: str, degraded: Sensor, reference: Sensor, around: Around = BOTH) -> Method:
@@ -145,7 +145,7 @@ def method_named(name: str, degraded: Sensor, reference: Sensor, around: Around 
         raise OptionError(
             f"{printable(repr(name))} in `methods` is not a method. Give {METHOD_NAMES}."
         )
-    sensor = Sensor.load(other) if other else degraded
+    sensor = degraded if other is None else Sensor.load(other)
     loaded = to_run_on(Network.load(network, sensor=sensor), sensor)
     weights = loaded.weights
     method = method_of(name, loaded, sensor, reference, around, degraded)
@@ -155,7 +155,7 @@ def method_named(name: str, degraded: Sensor, reference: Sensor, around: Around 
             logger.warning("%s: %s", network, warning)
         return method
     # A name with @SENSOR asks for that sensor: another one does not take its place.
-    if other:
+    if other is not None:
         return method
     int8 = loaded.precision == "int8"
 

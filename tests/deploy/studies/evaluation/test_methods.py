@@ -9,7 +9,7 @@ import pytest
 
 from beers_deploy.model.shipped import SHIPPED
 from beers_deploy.network_files import int8_for_sensor
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError, ProfileError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.studies.evaluation.calibrate import network_to_calibrate
@@ -32,6 +32,11 @@ from tests.deploy.studies.evaluation.small_pairs import (
 def test_an_unknown_method_is_refused(name: str) -> None:
     with pytest.raises(OptionError, match=r"`methods`|variant"):
         method_named(name, DEGRADED, REFERENCE)
+
+
+def test_an_at_sign_without_a_sensor_is_refused() -> None:
+    with pytest.raises(ProfileError, match="no profile ''"):
+        method_named("convbeers-xs@", DEGRADED, REFERENCE)
 
 
 @pytest.mark.parametrize(
