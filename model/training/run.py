@@ -39,7 +39,7 @@ from beers_deploy.model.training.trainer import Batches, Precision, Schedule, Tr
 from beers_deploy.model.training.validation import Validation, split_by_site, write_picture
 from beers_deploy.model.variants import variant_named
 from beers_deploy.profiles.errors import ModelError, OptionError
-from beers_deploy.profiles.sensor import numbers_of
+from beers_deploy.profiles.sensor import Sensor, numbers_of
 
 logger = logging.getLogger(__name__)
 
@@ -193,7 +193,7 @@ def data_sha256(run: Run, loss: RestorationLoss) -> str:
         loss: the loss, with or without LPIPS, whose weights may be missing when the run is resumed.
     """
     patches = run.patches
-    files = list(chain.from_iterable(map(list_images, run.images)))
+    files = image_files(run)
     for pair in pair_files(run.pairs) if run.pairs else []:
         files += pair
     weights = [path for path in (run.start, run.lpips) if path and path.is_file()]
@@ -229,8 +229,10 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
         sizes = run.patches.patch_px, recipe.batch
         source = StoredPairs(files, run.patches.degraded, *sizes, recipe.seed, *ranks)
         return source.batches, Validation([], *sensors), [degraded.name for degraded, _ in files]
-    scenes = read_scenes(run)
-    training, held_out = split_by_site([scene.name for scene in scenes], run.held_out)
+    images = image_files(run)
+    # The split may be refused, so it comes before the images are read.
+    training, held_out = split_by_site([file.name for file in images], run.held_out)
+    scenes = read_scenes(images, run.patches.reference)
     views = SENSOR_VIEWS if run.patches.family else 1
     held_out_scenes = list[Scene]()
     for number in held_out:
@@ -256,15 +258,19 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
     return patches.batches, validation, [scene.name for scene in train_on]
 
 
-def read_scenes(run: Run) -> list[Scene]:
-    """Read the images in the folders of the run."""
-    files = list(chain.from_iterable(map(list_images, run.images)))
+def image_files(run: Run) -> list[Path]:
+    """List the images in the folders of the run."""
+    return list(chain.from_iterable(map(list_images, run.images)))
+
+
+def read_scenes(files: Sequence[Path], reference: Sensor) -> list[Scene]:
+    """Read images as scenes of the reference sensor."""
     scenes = list[Scene]()
     if not files:
         return []
     with steps("reading", len(files)) as bar:
         for file in files:
-            scenes.append(read_scene(file, run.patches.reference.nominal()))
+            scenes.append(read_scene(file, reference.nominal()))
             bar.advance()
     return scenes
 

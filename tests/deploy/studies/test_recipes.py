@@ -96,9 +96,11 @@ def test_a_recipe_needs_images(tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
-def test_a_held_out_site_that_no_folder_shows_is_refused(
-    folders: list[Path], tmp_path: Path
+def test_a_held_out_site_that_no_folder_shows_is_refused_before_an_image_is_read(
+    tmp_path: Path,
 ) -> None:
     (tmp_path / "own.toml").write_text(RECIPE)
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "broken_1.png").write_text("no image")
     command = "train", "--recipe", tmp_path / "own.toml", "--out", tmp_path / "run"
-    assert "'town' is to be held out" in refused(*command, "--images", folders[0])
+    assert "'town' is to be held out" in refused(*command, "--images", tmp_path / "images")
