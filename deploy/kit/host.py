@@ -389,14 +389,13 @@ def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
     ]
 
 
-def main(source: str, target: str, runs: dict[float, Any], learn: bool) -> None:
-    """Restore the image in `source` into `target`, tile by tile; `runs` has each factor's core."""
+def read_image(source: str) -> np.ndarray:
+    """Read an image (C, H, W) of at least a tile, or exit with the reason why it is refused."""
     try:
-        image = np.load(source).astype(F)
+        image: np.ndarray = np.load(source).astype(F)
     except (EOFError, OSError, ValueError) as error:
         sys.exit(f"{source} cannot be read as an array of numbers: {error}")
     t = S["tile_px"]
-    r = S["scale"]
     whole = image.ndim == 3 and len(image) == S["channels"] and min(image.shape[1:]) >= t
     if not whole or not np.isfinite(image).all():
         sys.exit(
@@ -405,6 +404,16 @@ def main(source: str, target: str, runs: dict[float, Any], learn: bool) -> None:
         )
     if np.median(image * np.array(S["input_factors"], F)[:, None, None]) > 1:
         sys.exit(f"{source} is mostly above full scale. Divide its values by full scale.")
+    return image
+
+
+def main(source: str, target: str, runs: dict[float, Any], learn: bool) -> None:
+    """Restore the image in `source` into `target`, tile by tile; `runs` has each factor's core."""
+    image = read_image(source)
+    if not Path(target).parent.is_dir():
+        sys.exit(f"{target} cannot be written: no such folder. Create it first.")
+    t = S["tile_px"]
+    r = S["scale"]
     wide = np.pad(image, [(0, 0)] + [(0, -n % S["alignment_px"]) for n in image.shape[1:]], "edge")
     down, across = (spans(n, t, S["halo_px"]) for n in wide.shape[1:])
     out = np.empty((S["bands"], *(n * r for n in wide.shape[1:])), F)

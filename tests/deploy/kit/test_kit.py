@@ -196,6 +196,16 @@ def test_the_host_part_refuses_what_it_cannot_restore(
     assert not (tmp_path / "out.npy").exists()
 
 
+def test_the_host_part_refuses_a_folder_that_does_not_exist_before_the_run(
+    kit: Path, tmp_path: Path
+) -> None:
+    np.save(tmp_path / "image.npy", np.full((1, 96, 96), 0.1, np.float32))
+    host = runpy.run_path(str(kit / "host.py"))
+    with pytest.raises(SystemExit, match=r"cannot be written: no such folder"):
+        # Without a core the run itself would fail.
+        host["main"](tmp_path / "image.npy", tmp_path / "none" / "out.npy", {}, learn=False)
+
+
 def facts(folder: Path) -> dict[str, Any]:
     """Return the facts that a kit's host.py reads."""
     return dict(json.loads((folder / "host.json").read_text(encoding="utf-8")))
