@@ -252,11 +252,12 @@ def _method(
 
         def restore(image: np.ndarray) -> np.ndarray:
             restored = np.asarray(source(image))
-            if restored.shape != image.shape or restored.dtype.kind not in "uif":
+            finite = restored.dtype.kind in "uif" and np.isfinite(restored).all()
+            if restored.shape != image.shape or not finite:
                 raise ImageError(
                     f"The function {name} must return an image of {times(image.shape)}, got "
-                    f"{times(restored.shape) or 'no array'} of {restored.dtype}. Return one real "
-                    "number for each pixel."
+                    f"{times(restored.shape) or 'no array'} of {restored.dtype}. Return one "
+                    "finite real number for each pixel."
                 )
             return restored
 

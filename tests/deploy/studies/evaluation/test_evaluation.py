@@ -59,12 +59,13 @@ def test_the_command_on_a_folder_of_pairs(tmp_path: Path) -> None:
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.png", "b.png", "report.html"]
 
 
-def test_a_function_that_returns_another_shape_is_refused() -> None:
+def test_a_function_that_returns_another_shape_or_no_numbers_is_refused() -> None:
     image: Any = simulate(size=64, progress=False)
     functions: dict[str, Any] = {
         "no array": lambda _: None,
         "5 x 64": lambda dn: dn[:5],
         "64 x 64 of complex": lambda dn: dn + 1j,
+        "64 x 64 of float": lambda dn: dn * np.nan,
     }
     for words, function in functions.items():
         with pytest.raises(ImageError, match=f"function mine must return .* 64 x 64, got {words}"):
