@@ -30,16 +30,11 @@ from beers_deploy.quant.graph import (
     ties_scales,
 )
 from beers_deploy.quant.input_range import to_shares
+from beers_deploy.quant.integer.agreement import few_crops
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.quant.quantize import FINETUNE, Quantized
 from beers_deploy.quant.samples.patches import Patches
-from beers_deploy.quant.session import (
-    few_crops,
-    open_session,
-    planes_of,
-    result_of,
-    tensor_values,
-)
+from beers_deploy.quant.session import open_session, planes_of, result_of, tensor_values
 
 IN_INT8 = ".in_int8"
 """Suffix of the name of a tensor: its value computed by int8 weights and bias from float inputs,

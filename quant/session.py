@@ -6,7 +6,7 @@ Reading every tensor of a network at once needs memory that grows with the image
 
 from collections.abc import Iterable, Iterator, Mapping
 from copy import deepcopy
-from itertools import islice, pairwise, product
+from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,7 @@ from beers_deploy.quant.graph import (
 from beers_deploy.quant.graph.writer import graph_to_onnx
 from beers_deploy.quant.host_part import ONE_CHANNEL, HostPart
 from beers_deploy.quant.kernels import with_exact_sums, with_wide_convolutions
-from beers_deploy.quant.onnx.image_input import any_size, fixed_tile_px
+from beers_deploy.quant.onnx.image_input import any_size
 from beers_deploy.quant.onnx_file import is_quantized, load_onnx
 from beers_deploy.quant.untrusted import contradictions, times
 
@@ -298,24 +298,6 @@ def _places(
         for size, n in zip(image.shape[-2:], counts, strict=True)
     ]
     return product(*map(pairwise, edges))
-
-
-LAYER_PATCHES = 4
-
-
-def few_crops(images: Iterable[np.ndarray], model: ModelProto) -> list[np.ndarray]:
-    """Return one crop of each of the first LAYER_PATCHES images, on which figures of each layer are
-    measured.
-
-    Args:
-        images: (1, C, H, W).
-        model: the network. If it is fixed to one size, whole images are returned.
-
-    Returns:
-        Crops (1, C, h, w).
-    """
-    halo_px = None if fixed_tile_px(model) is not None else 0
-    return [crops(image, halo_px)[0] for image in islice(images, LAYER_PATCHES)]
 
 
 def with_outputs(model: ModelProto, kinds: Mapping[str, int]) -> ModelProto:

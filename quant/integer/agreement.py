@@ -2,10 +2,12 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from onnx import ModelProto, TensorProto
 
+from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.host_part import ZERO
@@ -19,12 +21,15 @@ from beers_deploy.quant.integer.reference import (
 )
 from beers_deploy.quant.onnx.image_input import any_size
 from beers_deploy.quant.session import (
-    few_crops,
+    TILE_PX,
     open_any_size,
     open_session,
     result_of,
     with_outputs,
 )
+from beers_deploy.quant.tiling.receptive_field import tiling_of
+
+LAYER_PATCHES = 4
 
 
 @dataclass(frozen=True)
@@ -87,6 +92,27 @@ def agreement(core: IntCore, host: ModelProto, image: np.ndarray) -> Agreement:
     return Agreement(layers, merged_correction(core, up), merged_correction(core, even))
 
 
+def few_crops(images: Iterable[np.ndarray], model: ModelProto) -> list[np.ndarray]:
+    """Return one crop of each of the first LAYER_PATCHES images, on which figures of each layer are
+    measured.
+
+    Args:
+        images: (1, C, H, W).
+        model: the network. If it is fixed to one size, or reads the whole image, whole images are
+            returned; otherwise sides that it accepts, of about TILE_PX.
+
+    Returns:
+        Crops (1, C, h, w).
+    """
+    try:
+        tiling = tiling_of(model)
+    except ModelError:
+        side_px = None
+    else:
+        side_px = tiling.fixed_px or tiling.whole_px(TILE_PX)
+    return [image[..., :side_px, :side_px] for image in islice(images, LAYER_PATCHES)]
+
+
 def integer_rows(
     model: ModelProto, core: IntCore, host: ModelProto, images: Iterable[np.ndarray]
 ) -> tuple[Row, ...]:
@@ -101,7 +127,7 @@ def integer_rows(
     Returns:
         A row for each integer operation, then one for the effect of the DPU's tie rounding.
     """
-    patches = few_crops(images, model)
+    patches = few_crops(images, host)
     agreements = [agreement(core, host, crop) for crop in patches]
     source = f"the integer reference on {len(agreements)} calibration patches"
     by_layer = zip(*(one.layers for one in agreements), strict=True)

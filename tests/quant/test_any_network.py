@@ -19,7 +19,7 @@ from beers_deploy.dpu.reading import network_of
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.encodings import as_on_board, board_model, encoding_faults, read_core
 from beers_deploy.quant.encodings.description import KEY
-from beers_deploy.quant.integer.agreement import agreement
+from beers_deploy.quant.integer.agreement import agreement, integer_rows
 from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.passes.selection import Passes
 from beers_deploy.quant.quantize import Quantized, quantize_model
@@ -80,6 +80,16 @@ def test_the_integer_reference_equals_the_runtime_bit_for_bit(name: str) -> None
     assert [layer.report.name for layer in layers.layers if layer.unequal] == []
     result = run_model(int8.host, image)
     assert_array_equal(int8.core.host_part.finish(image, layers.even), result)
+
+
+def test_layers_are_compared_at_a_size_that_the_network_accepts() -> None:
+    """Half of this sample's side is no multiple of the network's strides."""
+    int8 = quantized("unet")
+    side_px = 128 + tiling_of(int8.host).alignment_px
+    samples = images("unet", 1, side_px)
+    rows = integer_rows(float_network("unet"), int8.core, int8.host, samples)
+    *layers, _ = rows
+    assert {row.figures["as onnxruntime"].value for row in layers} == {100}
 
 
 @EACH
