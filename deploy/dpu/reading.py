@@ -8,6 +8,7 @@
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.image_input import require_image
 from beers_deploy.quant.onnx.window import Pair, Window
 from beers_deploy.quant.onnx_file import faults_named, load_onnx, metadata
+from beers_deploy.quant.tiling.receptive_field import tiling_of
 from beers_deploy.quant.untrusted import contradictions
 
 BANK_GAINS = np.arange(8 * GAINS[0], 8 * GAINS[1] + 1) / 8
@@ -73,12 +75,15 @@ def own_tile_px(model: onnx.ModelProto) -> int | None:
 
 def usual_tile_px(model: onnx.ModelProto) -> int:
     """Return the side in pixels of the image that a network is fixed to; else the smallest side of
-    at least TILE_PX whose pixels the host can move into channels.
+    at least TILE_PX that it accepts, and whose pixels the host can move into channels.
 
     Args:
         model: a float network, or an INT8 one as `as_on_board` returns it.
     """
     place_px, border_px = _places(model)
+    # A network that cannot be tiled may accept any size.
+    with suppress(ModelError):
+        place_px *= tiling_of(model).alignment_px
     whole_px = place_px * -(-(TILE_PX + 2 * border_px) // place_px)
     return own_tile_px(model) or whole_px - 2 * border_px
 

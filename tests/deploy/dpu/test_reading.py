@@ -1,5 +1,6 @@
 from pathlib import Path
 
+import numpy as np
 import onnx
 import pytest
 from onnx.helper import set_model_props
@@ -10,6 +11,7 @@ from beers_deploy.quant.encodings import BORDER_PX, PLACE_PX, board_model
 from beers_deploy.quant.onnx_file import metadata, save_onnx
 from tests.deploy.dpu.graphs import MYSTERY, SAME, board_convbeers, written
 from tests.quant.quick import fix_sizes
+from tests.quant.simplify.networks import parsed
 from tests.quant.tiling.small_networks import quantized_half_resolution
 
 
@@ -101,6 +103,13 @@ def test_the_usual_tile_has_whole_places(place_px: int, border_px: int, tmp_path
     assert read_network(tmp_path / "core.onnx", tile_px).operations
     fixed = board_model(quantized_half_resolution().core, {}, 64)
     assert usual_tile_px(fixed) == 64
+
+
+def test_the_usual_tile_is_one_that_the_network_accepts() -> None:
+    nodes = "c = Conv<strides=[3,3]>(x, third) y = ConvTranspose<strides=[3,3]>(c, third)"
+    third = np.ones((1, 1, 3, 3), np.float32)
+    model = parsed(nodes, "float[N,1,H,W] x => float[N,1,H,W] y", constants={"third": third})
+    assert usual_tile_px(model) == 642
 
 
 @pytest.mark.parametrize("text", ["0", "half", "1000000"])
