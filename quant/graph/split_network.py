@@ -283,7 +283,7 @@ def _sizes(graph: Graph, size: Pair) -> dict[str, Pair]:
     return sizes
 
 
-WHOLE_PX = 64 * 3 * 5 * 7
+WHOLE_PX = 1024 * 3 * 5 * 7
 """A side that the factors of all practical networks divide without a remainder."""
 
 

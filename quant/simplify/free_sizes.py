@@ -7,8 +7,8 @@ them.
    Pad by nothing, a Slice of the whole map, and an Expand that arithmetic does anyway. Let a
    convolution repeat a channel, and write a map of one number per channel, such as a noise level.
 3. Do both for two sizes. If the networks are equal, the size has no effect, and theirs is the
-   network of every image whose sides are multiples of `MULTIPLE_PX`. Otherwise the network is not
-   changed.
+   network of every image whose sides are multiples of one of `MULTIPLES_PX`. Otherwise the network
+   is not changed.
 4. Free a fixed height and width that differ, which no tile has, if they have no effect.
 
 Exporters write such arithmetic for a U-Net that pads or enlarges to the size of its skips, for
@@ -40,10 +40,14 @@ from beers_deploy.quant.simplify.rearrangements import (
 )
 from beers_deploy.quant.simplify.slices import TO_THE_END, slices_of
 
-MULTIPLE_PX = 64
-"""Six levels of a U-Net halve sides of this length without a remainder."""
-SIZES_PX = (2 * MULTIPLE_PX, 3 * MULTIPLE_PX), (4 * MULTIPLE_PX, 3 * MULTIPLE_PX)
-"""Rows and columns differ, so that a network that confuses them is detected."""
+MULTIPLES_PX = 64, 512
+"""Six levels of a U-Net, and nine, halve sides of these lengths without a remainder."""
+MOST_LEVELS = 6
+"""A network of no more strided windows is not tried on the larger images, which take long."""
+SIZES = (2, 3), (4, 3)
+"""Rows and columns of two images, as multiples. They differ, so that a network that confuses them
+is detected.
+"""
 SIZED = {"Expand", "Pad", "Resize", "Shape", "Size", "Slice"}
 """Operators that may need the size of an image."""
 LOCAL = ELEMENTWISE | {
@@ -81,8 +85,8 @@ def free_sizes(model: ModelProto, fold: Fold) -> ModelProto:
         fold: a function that folds the constants of a network, as onnxruntime does.
 
     Returns:
-        The network for images whose sides are multiples of MULTIPLE_PX; `model` itself if the size
-        has an effect.
+        The network for images whose sides are multiples of one of MULTIPLES_PX; `model` itself if
+        the size has an effect.
     """
     graph = OnnxGraph(model)
     if not any(
@@ -95,16 +99,30 @@ def free_sizes(model: ModelProto, fold: Fold) -> ModelProto:
         for node in graph.nodes
     ):
         return model
+    strided = sum(max(node.attribute("strides") or [1]) > 1 for node in graph.nodes)
+    multiples_px = MULTIPLES_PX if strided > MOST_LEVELS else MULTIPLES_PX[:1]
+    for multiple_px in multiples_px:
+        network = _of_multiples(model, multiple_px, fold)
+        if network is not None:
+            return network
+    return model
+
+
+def _of_multiples(model: ModelProto, multiple_px: int, fold: Fold) -> ModelProto | None:
+    """Return the network for images whose sides are multiples of a number of pixels; None if the
+    size has an effect on it (3).
+    """
+    sizes_px = np.multiply(SIZES, multiple_px).tolist()
     try:
-        first, second = (_of_size(model, rows, columns, fold) for rows, columns in SIZES_PX)
+        first, second = (_of_size(model, rows, columns, fold) for rows, columns in sizes_px)
     # A network may demand other sizes.
     except ModelError:
-        return model
+        return None
     first_constants, second_constants = (
         {tensor.name: tensor for tensor in network.graph.initializer} for network in (first, second)
     )
     if first.graph.node != second.graph.node or first_constants != second_constants:
-        return model
+        return None
     # The sizes that the file states are as free as before.
     replace_all(first.graph.input, model.graph.input)
     replace_all(first.graph.output, model.graph.output)

@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from beers_deploy.quant.graph import refusal
 from beers_deploy.quant.simplify.simplify import simplify
-from tests.quant.quick import assert_same, run_model
+from tests.quant.quick import assert_same, run_model, uniform
 from tests.quant.simplify.networks import network_from
 
 FEATURES = 4
@@ -59,6 +59,26 @@ class ResizedUNet(PaddedUNet):
     def forward(self, image: Tensor) -> Tensor:
         """Map images (N, 1, H, W) to the same shape."""
         return torch.clamp(image + super().forward(image), 0, 1)
+
+
+class DeepUNet(nn.Module):
+    """A U-Net of eight levels, as pix2pix has, that resizes features to the size of the skip."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.halve = nn.Conv2d(1, 1, 3, stride=2, padding=1)
+        self.join = nn.Conv2d(2, 1, 3, padding=1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Map images (N, 1, H, W) to the same shape."""
+        levels = [image]
+        for _ in range(8):
+            levels.append(self.halve(levels[-1]))
+        result = levels.pop()
+        for fine in reversed(levels):
+            large = functional.interpolate(result, size=fine.shape[2:])
+            result = self.join(torch.cat([large, fine], 1))
+        return result
 
 
 class Gated(nn.Module):
@@ -179,7 +199,7 @@ def exported(module: nn.Module) -> onnx.ModelProto:
     axes = {"input": {2: "height", 3: "width"}, "output": {2: "h", 3: "w"}}
     how: dict[str, Any] = {"input_names": ["input"], "output_names": ["output"]}
     how |= {"dynamic_axes": axes, "opset_version": 17, "dynamo": False}
-    image = torch.zeros(1, 1, 32, 32)
+    image = torch.zeros(1, 1, 256, 256)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.onnx.export(module.eval(), (image,), file, **how)  # type: ignore[arg-type]
@@ -187,26 +207,29 @@ def exported(module: nn.Module) -> onnx.ModelProto:
 
 
 @pytest.mark.parametrize(
-    "make",
+    ("make", "image"),
     [
-        PaddedUNet,
-        ResizedUNet,
-        Gated,
-        Shuffled,
-        Repeated,
-        NoiseLevel,
-        UnshuffledNoiseLevel,
-        Blocks,
+        (PaddedUNet, IMAGE),
+        (ResizedUNet, IMAGE),
+        (DeepUNet, uniform(1, 1, 256, 512)),
+        (Gated, IMAGE),
+        (Shuffled, IMAGE),
+        (Repeated, IMAGE),
+        (NoiseLevel, IMAGE),
+        (UnshuffledNoiseLevel, IMAGE),
+        (Blocks, IMAGE),
     ],
 )
-def test_sizes_are_gone_and_results_are_the_same(make: Callable[[], nn.Module]) -> None:
+def test_sizes_are_gone_and_results_are_the_same(
+    make: Callable[[], nn.Module], image: np.ndarray
+) -> None:
     """Sides need not be multiples of 64, if the network halves them evenly."""
     model = exported(make())
     short = simplify(model, "a.onnx")
     left = Counter(node.op_type for node in short.graph.node)
     assert not left.keys() & {"Shape", "Slice", "Split", "Pad", "Expand", "Gather"}
     assert refusal(short) == ""
-    assert_same(model, short, IMAGE, atol=1e-6)
+    assert_same(model, short, image, atol=1e-6)
 
 
 class Enlarged(nn.Module):
