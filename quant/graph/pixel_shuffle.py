@@ -123,6 +123,8 @@ def _growth(result: np.ndarray, shape: tuple[int, int, int, int]) -> Fraction | 
     if result.ndim != 4 or len(result) != shape[0]:
         return None
     growth = Fraction(result.shape[2], shape[2])
+    if result.shape[3] != growth * shape[3]:
+        return None
     rows, columns = (source // growth.denominator for source in np.unravel_index(result, shape)[2:])
     down, across = (np.arange(side) // growth.numerator for side in result.shape[2:])
     # The numerator or the denominator is 1 if blocks become pixels, or pixels become blocks.

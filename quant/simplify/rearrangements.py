@@ -102,7 +102,10 @@ def _enlarged(
 ) -> Replacement:
     """Return the operator that enlarges a map of numbers so; None if it is no enlargement (2)."""
     factor = moved.shape[2] // image.shape[2]
-    if np.array_equal(moved, image.repeat(factor, 2).repeat(factor, 3)):
+    if moved.shape[2:] != (factor * image.shape[2], factor * image.shape[3]):
+        return None
+    is_of_channels = moved.shape[1] == image.shape[1]
+    if is_of_channels and np.array_equal(moved, image.repeat(factor, 2).repeat(factor, 3)):
         scales = graph.add_constant(f"{node.result}.scales", [1, 1, factor, factor])
         return [node.replaced_by("Resize", [source, "", scales], **OF_BLOCKS)]
     batch, channels, *_ = moved.shape

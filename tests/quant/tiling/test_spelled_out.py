@@ -16,6 +16,7 @@ from beers_deploy.quant.graph import read_network
 from beers_deploy.quant.graph.pixel_shuffle import with_shuffles
 from beers_deploy.quant.simplify.simplify import simplify
 from beers_deploy.quant.tiling.receptive_field import Tiling, tiling_of
+from tests.quant.simplify.networks import parsed
 from tests.quant.tiling.small_networks import network
 
 
@@ -86,6 +87,12 @@ def test_other_operators_that_move_pixels_are_not_changed(nodes: str) -> None:
     assert [node.proto for node in with_shuffles(model).nodes] == list(model.graph.node)
     with pytest.raises(ModelError, match=" moves pixels"):
         tiling_of(model)
+
+
+def test_a_column_that_becomes_channels_is_no_shuffle() -> None:
+    ends = "float[1,1,16,1] image => float[1,16,1,1] restored"
+    model = parsed("restored = Reshape(image, sizes)", ends, constants={"sizes": [1, 16, 1, 1]})
+    assert [node.op_type for node in with_shuffles(model).nodes] == ["Reshape"]
 
 
 def test_operators_that_cancel_are_a_shuffle_of_block_one() -> None:
