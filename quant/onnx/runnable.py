@@ -32,6 +32,7 @@ KEEPING = {
     "Identity",
     "Neg",
     "QuantizeLinear",
+    "RandomUniformLike",
     "Reshape",
     "Sqrt",
     "Squeeze",
@@ -105,7 +106,7 @@ LIST_VALUES = 4096
 COMPUTED = (
     KEEPING
     | FILLING
-    | {"Add", "Concat", "Div", "Equal", "Gather", "Mul", "Shape", "Slice", "Sub", "Where"}
+    | {"Add", "Concat", "Div", "Equal", "Gather", "Mod", "Mul", "Shape", "Slice", "Sub", "Where"}
 )
 """Operators whose results are computed if they are short lists of numbers."""
 

@@ -1,5 +1,5 @@
 """Reject networks that were exported in training mode, in which Dropout draws and
-BatchNormalization adapts.
+BatchNormalization adapts. Stochastic depth (DropPath) draws by nodes of its own.
 
 Such a network returns another result for each run or for each tile. It is rejected before these
 nodes are folded.
@@ -16,6 +16,7 @@ IS_TEST_UNTIL = 6
 they are in training mode.
 """
 DROPOUT_MODE_INPUT = 2
+DRAWING = {"Bernoulli", "RandomNormal", "RandomNormalLike", "RandomUniform", "RandomUniformLike"}
 
 
 def require_inference(model: ModelProto, where: str) -> None:
@@ -41,7 +42,9 @@ def require_inference(model: ModelProto, where: str) -> None:
 
 
 def _is_in_training(graph: OnnxGraph, node: Node, opset: int) -> bool:
-    """Return True if a Dropout draws, or a BatchNormalization adapts to the image."""
+    """Return True if a node draws at random, or a BatchNormalization adapts to the image."""
+    if node.op_type in DRAWING:
+        return True
     if node.op_type not in ("BatchNormalization", "Dropout"):
         return False
     if opset <= IS_TEST_UNTIL:

@@ -15,7 +15,7 @@ from onnx import TensorProto, helper, numpy_helper
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import load_onnx, parse_onnx
-from beers_deploy.quant.session import open_session, run
+from beers_deploy.quant.session import open_session, result_of, run
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from beers_deploy.quant.untrusted import FILE_BYTES
 from tests.deploy.dpu.draws import placed
@@ -181,6 +181,14 @@ def test_nodes_that_could_harm_a_runtime_are_refused(
     # ONNX's own checker would refuse some of these first, with other words.
     with patch("onnx.checker.check_model"):
         assert words in refusal(model)
+
+
+def test_pads_that_torch_computes_from_a_fixed_size_are_known() -> None:
+    """A network pads its image to a multiple: (8 - height % 8) % 8."""
+    sizes = constant("a", 8, 8, 8, 8, 8, 8, 4, 2) + constant("b", 8) + "p = Mod(a, b) "
+    model = parsed(sizes + "y = Pad(image, p)", ENDS)
+    session = open_session(parse_onnx(model.SerializeToString(), "untrusted.onnx"), 1)
+    assert result_of(session, IMAGE).shape == (1, 1, 16, 16)
 
 
 def test_computed_weights_run_once_saved_as_the_message_says(tmp_path: Path) -> None:

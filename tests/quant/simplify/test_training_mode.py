@@ -18,6 +18,7 @@ TRAINING = {
     "dropout of a mode that is computed": (f"{COMPUTED} {DROPOUT}", 17),
     "normalisation": (f"d, m, v = {NORMAL.format('<training_mode=1>')}", 17),
     "normalisation by its outputs": (f"d, m, v, sm, sv = {NORMAL.format('')}", 9),
+    "stochastic depth": ("r = RandomUniformLike<dtype=1>(half) d = Mul(c, r)", 17),
     "old dropout": ("d = Dropout(c)", 6),
 }
 INFERENCE = {
