@@ -10,9 +10,11 @@ A Split, Slice or Gather along the channels has parts, each a list of channels:
    convolution reads the whole map, with zeros for the channels that are not selected. The selection
    would round the map once more, to a scale that equalisation does not reach.
 
+4. A write into some channels, as in x[:, :8] = y, is a concat of the others with what is written.
+
 A DPU adds and multiplies maps of one number of channels:
 
-4. A map of one channel that meets several is repeated first, as a Tile along the channels does.
+5. A map of one channel that meets several is repeated first, as a Tile along the channels does.
 
 All of it is exact. The divided nodes remain, and are removed if nothing reads them.
 """
@@ -32,6 +34,54 @@ Part = tuple[str, np.ndarray]
 """The name of a part, and the numbers of its channels."""
 HOST = {"Clip", "DepthToSpace"}
 """Operators that the host computes behind the sum with the image."""
+
+
+def join_written(graph: OnnxGraph, node: Node) -> Replacement:
+    """Replace a write into channels that follow each other by a concat (point 4 of the module).
+
+    torch exports it as a ScatterND; its newer exporter, between Transposes of batch and channels.
+
+    Args:
+        graph: the graph that the node belongs to; its constants are extended.
+        node: any node.
+
+    Returns:
+        The selections of the other channels, and the concat; None if the node is something else.
+    """
+    is_swapped = _is_swap(node)
+    scatter = graph.writer(node.source) if is_swapped else node
+    places = graph.value(scatter, 1) if scatter.op_type == "ScatterND" else None
+    if places is None or not places.size or scatter.attribute("reduction", "none") != "none":
+        return None
+    whole, _, written = scatter.inputs
+    if is_swapped:
+        swaps = graph.writer(whole), graph.writer(written)
+        if not all(map(_is_swap, swaps)):
+            return None
+        whole, written = (swap.source for swap in swaps)
+    *images, channels = places.reshape(-1, places.shape[-1]).T
+    first = channels[0]
+    last = channels[-1] + 1
+    numbers = np.arange(graph.channels(whole))
+    follows = np.array_equal(channels, numbers[first:last])
+    # A place is a channel of the first image, or of swapped axes a channel alone.
+    is_of_channels = len(images) == 1 - is_swapped and not np.any(images)
+    if not follows or not is_of_channels or graph.channels(written) != len(channels):
+        return None
+    names = [written]
+    selections = []
+    for place, chosen in ((0, numbers[:first]), (2, numbers[last:])):
+        if len(chosen):
+            name = f"{node.result}.part_{place}"
+            order = graph.add_constant(f"{name}.order", chosen, np.int64)
+            selections.append(Node.new("Gather", [whole, order], name, axis=1))
+            names.insert(place, name)
+    return [*selections, node.replaced_by("Concat", names, axis=1)]
+
+
+def _is_swap(node: Node) -> bool:
+    """Return True if a node swaps the axes of batch and channels."""
+    return node.op_type == "Transpose" and node.attribute("perm") == [1, 0, 2, 3]
 
 
 def split_channels(graph: OnnxGraph, node: Node) -> Replacement:

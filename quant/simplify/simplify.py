@@ -62,6 +62,7 @@ from beers_deploy.quant.simplify.activations_first import (
 )
 from beers_deploy.quant.simplify.branches import JoinBranches
 from beers_deploy.quant.simplify.channels import (
+    join_written,
     read_unselected,
     repeat_channels,
     split_channels,
@@ -187,6 +188,7 @@ def _run_passes(model: ModelProto) -> None:
         replace_powers,
         divide_by_reciprocal,
         drop_where,
+        join_written,
     ):
         graph.rewrite(replacement)
     # Nodes that were replaced would count as readers.

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
+from numpy.typing import ArrayLike
 from onnx import TensorProto, helper
 
 from beers_deploy.float_onnx import to_onnx
@@ -21,6 +22,7 @@ from beers_deploy.quant.domains import OPSET
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.session import open_session, tensors_of
 from beers_deploy.quant.simplify.simplify import simplify
+from tests.quant.quick import assert_same, uniform
 from tests.quant.simplify.networks import CASES, CHANNELS, CONV, NORMAL, SAME, network_from
 from tests.shipped import shipped_pair
 
@@ -73,6 +75,34 @@ def test_branches_with_an_axis_of_their_own_are_channels(
     """SKNet selects the branches that it chooses among, and MIRNet adds them up."""
     ends = "float[2,4,9,11] x => float[N,C,H,W] y"
     assert folded(network_from(f"{CONV} {nodes}", ends=ends)) == remaining
+
+
+SWAP = "Transpose<perm=[1,0,2,3]>"
+OLD_WRITE = "y = ScatterND(c, places, p)"
+NEW_WRITE = f"s = {SWAP}(c) t = {SWAP}(p) u = ScatterND(s, places, t) y = {SWAP}(u)"
+
+
+@pytest.mark.parametrize(
+    ("write", "places", "remaining"),
+    [
+        (OLD_WRITE, [[[0, 1], [0, 2]]], {"Conv": 4, "Concat": 1}),
+        (NEW_WRITE, [[1], [2]], {"Conv": 4, "Concat": 1}),
+        (NEW_WRITE, [[0], [1]], {"Conv": 3, "Concat": 1}),
+        (NEW_WRITE, [[2], [1]], {"Conv": 2, "Transpose": 3, "ScatterND": 1}),
+        (NEW_WRITE, [[-2], [-1]], {"Conv": 2, "Transpose": 3, "ScatterND": 1}),
+    ],
+)
+def test_a_write_into_channels_is_a_concat(
+    write: str, places: ArrayLike, remaining: dict[str, int]
+) -> None:
+    """PLKSR convolves some channels in place."""
+    ends = "float[1,4,9,11] x => float[1,4,9,11] y"
+    nodes = f"{CONV} p = Conv(c, narrow) {write}"
+    narrow = np.full((2, 4, 1, 1), 0.3)
+    model = network_from(nodes, ends=ends, narrow=narrow, places=places)
+    short = simplify(model, "a.onnx")
+    assert kinds(short) == remaining
+    assert_same(model, short, uniform(1, 4, 9, 11))
 
 
 CONVOLUTIONS = {"Conv", "ConvTranspose"}
