@@ -320,4 +320,6 @@ def _refused(graph: OnnxGraph, node: Node) -> ModelError:
     ):
         # A part of Mish.
         remedy = ADAPT
+    if node.op_type == "Pad" and graph.numbers(node, 1, "pads") is None:
+        remedy = OF_ONE_SIZE
     return unsupported(f"The DPU does not compute the operation {node}.", remedy)

@@ -306,9 +306,18 @@ class Cropped(nn.Module):
         return torch.cat([image, image[:, :, :rows]], 2)
 
 
-def test_arithmetic_that_depends_on_the_size_stays_and_is_refused() -> None:
+class Lengthened(nn.Module):
+    """A network that appends a tenth of its rows as zeros, whatever their number."""
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Map images (N, 1, H, W) to (N, 1, H + H // 10, W)."""
+        return functional.pad(image, (0, 0, 0, image.shape[2] // 10))
+
+
+@pytest.mark.parametrize("module", [Cropped(), Lengthened()])
+def test_arithmetic_that_depends_on_the_size_stays_and_is_refused(module: nn.Module) -> None:
     """The refusal says what to do."""
-    model = simplify(exported(Cropped()), "a.onnx")
+    model = simplify(exported(module), "a.onnx")
     assert any(node.op_type == "Shape" for node in model.graph.node)
     assert "Export it with fixed height and width" in refusal(model)
 
