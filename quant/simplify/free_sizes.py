@@ -2,10 +2,11 @@
 them.
 
 1. Set the free sizes of the image to numbers, so that the runtime folds arithmetic on shapes.
-2. Write a Resize to a size as one by factors, pads in place of auto_pad SAME, and what only moves
-   and repeats values as one operator (`rearrangements`). Let crops count from the end. Remove a
-   Pad by nothing, a Slice of the whole map, and an Expand that arithmetic does anyway. Let a
-   convolution repeat a channel, and write a map of one number per channel, such as a noise level.
+2. Write a Resize to a size as one by factors, pads in place of auto_pad SAME, pools that round
+   whole sizes up as ones that round down, and what only moves and repeats values as one operator
+   (`rearrangements`). Let crops count from the end. Remove a Pad by nothing, a Slice of the whole
+   map, and an Expand that arithmetic does anyway. Let a convolution repeat a channel, and write a
+   map of one number per channel, such as a noise level.
 3. Do both for two sizes. If the networks are equal, the size has no effect, and theirs is the
    network of every image whose sides are multiples of one of `MULTIPLES_PX`. Otherwise the network
    is not changed.
@@ -93,6 +94,7 @@ def free_sizes(model: ModelProto, fold: Fold) -> ModelProto:
         is_rearrangement(graph, node)
         or node.attribute("keepdims", 1) == 0
         or leaves_pads(node)
+        or node.attribute("ceil_mode")
         or node.attribute("perm") == TO_LAST
         or node.op_type in SIZED
         or (node.op_type == "Concat" and graph.constants.keys() & {*node.inputs})
@@ -210,14 +212,22 @@ def _cropped(graph: OnnxGraph, node: Node) -> Replacement:
     return [node.replaced_by("Slice", [node.source, *places])]
 
 
-def _with_pads(graph: OnnxGraph, node: Node) -> Replacement:
-    """Return a strided window with its pads in place of auto_pad SAME; None if it states them."""
+def _with_stated_sizes(graph: OnnxGraph, node: Node) -> Replacement:
+    """Return a strided window with its pads in place of auto_pad SAME, or without a ceil_mode that
+    has no effect; None for other windows.
+    """
     weight = graph.value(node, 1)
     _, _, rows, columns = graph.shapes[node.source]
-    match = node.window(() if weight is None else weight.shape[2:], (rows, columns))
-    if match is None or not leaves_pads(node):
+    size = rows, columns
+    match = node.window(() if weight is None else weight.shape[2:], size)
+    if match is None or not (leaves_pads(node) or node.attribute("ceil_mode")):
         return None
-    attributes = {**node.attributes, "auto_pad": "NOTSET", "pads": list(match[1].pads)}
+    kernel, window = match
+    rounded_down = tuple(window.output_size(axis, kernel[axis], size[axis]) for axis in (0, 1))
+    if rounded_down != graph.shapes[node.result][2:]:
+        return None
+    attributes = {key: value for key, value in node.attributes.items() if key != "ceil_mode"}
+    attributes |= {"auto_pad": "NOTSET", "pads": list(window.pads)}
     return [node.replaced_by(node.op_type, node.inputs, **attributes)]
 
 
@@ -305,7 +315,7 @@ SPECIAL: dict[str, Rewriting] = {
     "Expand": _expanded,
     "Resize": _by_factors,
     "Slice": _cropped,
-    **dict.fromkeys(("AveragePool", "Conv", "MaxPool"), _with_pads),
+    **dict.fromkeys(("AveragePool", "Conv", "MaxPool"), _with_stated_sizes),
 }
 """The function for each operator that returns the nodes which replace one."""
 

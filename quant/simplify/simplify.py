@@ -35,7 +35,7 @@ models that `quant.onnx.runnable` accepted are simplified, because a runtime ope
 
 from copy import deepcopy
 from functools import partial
-from itertools import chain, product
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -256,7 +256,10 @@ def _is_plain(model: ModelProto) -> bool:
         ReadImage(graph),
         repeat_channels,
     ]
-    return not any(rewriting(graph, node) for node, rewriting in product(graph.nodes, rewritings))
+    return not any(
+        node.attribute("ceil_mode") or any(rewriting(graph, node) for rewriting in rewritings)
+        for node in graph.nodes
+    )
 
 
 def _to_float_image(graph: GraphProto) -> None:

@@ -29,6 +29,7 @@ class PaddedUNet(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.fine = nn.Conv2d(1, FEATURES, 3, padding=1)
+        self.pool: nn.Module = nn.MaxPool2d(2)
         self.deep = nn.Conv2d(FEATURES, FEATURES, 3, padding=1)
         self.up = nn.ConvTranspose2d(FEATURES, FEATURES, 2, stride=2)
         self.tail = nn.Conv2d(2 * FEATURES, 1, 1)
@@ -44,13 +45,19 @@ class PaddedUNet(nn.Module):
     def forward(self, image: Tensor) -> Tensor:
         """Map images (N, 1, H, W) to the same shape."""
         fine = torch.relu(self.fine(image))
-        deep = torch.relu(self.deep(functional.max_pool2d(fine, 2)))
+        deep = torch.relu(self.deep(self.pool(fine)))
         result: Tensor = self.tail(torch.cat([self.enlarged(deep, fine), fine], 1))
         return result
 
 
 class ResizedUNet(PaddedUNet):
-    """A U-Net that resizes features to the size of the skip, and clips its result."""
+    """A U-Net that pools an incomplete pair of rows too, as U2-Net does, resizes features to the
+    size of the skip, and clips its result.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.pool = nn.AvgPool2d(2, ceil_mode=True, count_include_pad=False)
 
     def enlarged(self, deep: Tensor, fine: Tensor) -> Tensor:
         """Return deep features at the size of fine ones, (1, F, H, W)."""
@@ -304,6 +311,15 @@ class Cropped(nn.Module):
         """Map images (N, 1, H, W) to (N, 1, H + H // 10, W)."""
         rows = image.shape[2] // 10
         return torch.cat([image, image[:, :, :rows]], 2)
+
+
+def test_a_pool_that_rounds_up_with_an_effect_stays() -> None:
+    """Of eight pixels, windows of three with a stride of two leave one over."""
+    pool = "y = MaxPool<kernel_shape=[3,3], strides=[2,2], ceil_mode=1>(c)"
+    model = network_from(f"c = Conv<pads=[1,1,1,1]>(x, w) {pool}")
+    short = simplify(model, "a.onnx")
+    assert "ceil_mode 0" in refusal(short)
+    assert_same(model, short, uniform(1, 4, 8, 8))
 
 
 class Lengthened(nn.Module):
