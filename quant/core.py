@@ -7,6 +7,7 @@ A tensor with n fractional bits holds integer multiples of its scale 2^-n, in [-
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,25 +36,23 @@ class Shifts:
     source, Vitis-AI 3.0).
 
     A DPU moves between scales 2^-n by shifting, and each kind of shift has a smallest and a largest
-    value in bits. The quantiser writes within these ranges, which are called windows here. Files
-    are checked against `deploy.dpu.checker.number_rules`, which allows a little more (a bias finer
-    than the accumulator).
+    value in bits. The quantiser writes within these ranges. Files are checked against
+    `deploy.dpu.checker.number_rules`, which allows a little more (a bias finer than the
+    accumulator).
 
     Attributes:
-        cut: the range of shift_cut: the fractional bits of a convolution's weights plus those of
-            its input, minus those of its result.
-        bias: the range of shift_bias: the fractional bits of weights plus input, minus those of the
-            int8 bias. Below 0 the bias would be finer than the accumulator.
-        read: the range of shift_read: the difference of fractional bits between the inputs of an
-            add.
-        write: the range of shift_write: the fractional bits of an add's coarsest input minus those
-            of its result.
+        shift_cut: the fractional bits of a convolution's weights plus those of its input, minus
+            those of its result.
+        shift_bias: the fractional bits of weights plus input, minus those of the int8 bias. Below 0
+            the bias would be finer than the accumulator.
+        shift_read: the difference of fractional bits between the inputs of an add.
+        shift_write: the fractional bits of an add's coarsest input minus those of its result.
     """
 
-    cut: tuple[int, int] = (0, 16)
-    bias: tuple[int, int] = (0, 16)
-    read: tuple[int, int] = (0, 15)
-    write: tuple[int, int] = (-15, 15)
+    shift_cut: tuple[int, int] = (0, 16)
+    shift_bias: tuple[int, int] = (0, 16)
+    shift_read: tuple[int, int] = (0, 15)
+    shift_write: tuple[int, int] = (-15, 15)
 
 
 SHIFTS = Shifts()
@@ -66,18 +65,19 @@ def target_shifts(target: TargetProfile) -> Shifts:
         target: the profile of the board, whose table `numbers` states the constants of each shift.
     """
 
-    def window(key: str) -> tuple[int, int]:
+    def allowed(key: str) -> tuple[int, int]:
         constant = target.constant("numbers", key)
         return int(constant.low), int(constant.high)
 
     # Boards allow a bias finer than the accumulator, whose lowest bits are lost: none is written.
     bias = 0, int(target.value("numbers", "shift_bias_max"))
-    return Shifts(window("shift_cut"), bias, window("shift_read"), window("shift_write"))
+    return Shifts(allowed("shift_cut"), bias, allowed("shift_read"), allowed("shift_write"))
 
 
-def clamp(value: int, window: tuple[int, int]) -> int:
-    """Return the integer from window[0] to window[1], both included, that is nearest to `value`."""
-    return min(max(value, window[0]), window[1])
+def clamp(bits: int, allowed: tuple[int, int]) -> int:
+    """Return the shift that is nearest to `bits` among those allowed."""
+    low, high = allowed
+    return min(max(bits, low), high)
 
 
 ROUNDS = 8
@@ -180,9 +180,22 @@ def rounded_to(values: np.ndarray, frac_bits: int) -> np.ndarray:
     return np.asarray(np.clip(units, INT8_MIN, INT8_MAX) / scale)
 
 
-RoundedConvs = dict[tuple[str, int, int], tuple[Conv, IntConv, int]]
+class RoundedConv(NamedTuple):
+    """A convolution before and after it was rounded to integers.
+
+    Attributes:
+        op: the float convolution.
+        rounded: the convolution in integers.
+        output_frac_bits: the number of fractional bits of its result, which the shifts reach.
+    """
+
+    op: Conv
+    rounded: IntConv
+    output_frac_bits: int
+
+
+RoundedConvs = dict[tuple[str, int, int], RoundedConv]
 """Convolutions that were rounded before, by name and the requested fractional bits of input and
-output. The values are the float convolution, the integer one, and the fractional bits of its
 output.
 """
 
@@ -217,7 +230,8 @@ def build_core(
     legal = dict(frac_bits)
     # Each round starts from the scales that the one before has moved.
     for _ in range(ROUNDS):
-        core = _in_one_round(graph, legal, shifts, host_part, earlier)
+        ops = [_rounded(op, legal, shifts, earlier) for op in graph]
+        core = IntCore(tuple(ops), dict(legal), host_part)
         faults = shift_faults(core, shifts)
         if faults:
             continue
@@ -234,70 +248,62 @@ def build_core(
     )
 
 
-def _in_one_round(
-    graph: Graph,
-    frac_bits: dict[str, int],
-    shifts: Shifts,
-    host_part: HostPart,
-    earlier: RoundedConvs,
-) -> IntCore:
-    """Quantise every operation within the shifts' reach of the scales before it, which it may
-    change.
+def _rounded(
+    op: Op, frac_bits: dict[str, int], shifts: Shifts, earlier: RoundedConvs
+) -> IntConv | Op:
+    """Return an operation in integers, after moving scales in `frac_bits` until the shifts reach
+    from its inputs to its output.
     """
-    ops: list[IntConv | Op] = []
-    for op in graph:
-        if isinstance(op, Conv):
-            key = op.name, frac_bits[op.input], frac_bits[op.output]
-            # A candidate of a search differs from the one before in few convolutions.
-            if key not in earlier or earlier[key][0] is not op:
-                rounded = _quantize_conv(op, frac_bits, shifts)
-                earlier[key] = op, rounded, frac_bits[op.output]
-            _, rounded, frac_bits[op.output] = earlier[key]
-            ops.append(rounded)
-            continue
-        if isinstance(op, Add):
-            # The coarsest input stays, because a finer scale would make it clip. Finer inputs come
-            # nearer.
-            coarse = min(frac_bits[name] for name in op.inputs)
-            for name in op.inputs:
-                frac_bits[name] = coarse + clamp(frac_bits[name] - coarse, shifts.read)
-            frac_bits[op.output] = coarse - clamp(coarse - frac_bits[op.output], shifts.write)
-        elif isinstance(op, Mul):
-            # A product has the fractional bits of both factors; only the result's scale can move.
-            finest = sum(frac_bits[name] for name in op.inputs)
-            frac_bits[op.output] = finest - clamp(finest - frac_bits[op.output], shifts.cut)
-        elif ties_scales(op):
-            # Inputs and output have one scale: the coarsest of them, because a finer one clips, or
-            # that of the planes, which the host writes.
-            names = (*op.inputs, op.output)
-            shared = frac_bits[PLANES] if PLANES in names else min(frac_bits[n] for n in names)
-            frac_bits.update(dict.fromkeys(names, shared))
-        ops.append(op)
-    return IntCore(tuple(ops), dict(frac_bits), host_part)
+    if isinstance(op, Conv):
+        key = op.name, frac_bits[op.input], frac_bits[op.output]
+        # A candidate of a search differs from the one before in few convolutions.
+        if key not in earlier or earlier[key].op is not op:
+            earlier[key] = _quantize_conv(op, frac_bits[op.input], frac_bits[op.output], shifts)
+        frac_bits[op.output] = earlier[key].output_frac_bits
+        return earlier[key].rounded
+    if isinstance(op, Add):
+        # The coarsest input stays, because a finer scale would make it clip. Finer inputs come
+        # nearer.
+        coarse = min(frac_bits[name] for name in op.inputs)
+        for name in op.inputs:
+            frac_bits[name] = coarse + clamp(frac_bits[name] - coarse, shifts.shift_read)
+        frac_bits[op.output] = coarse - clamp(coarse - frac_bits[op.output], shifts.shift_write)
+    elif isinstance(op, Mul):
+        # A product has the fractional bits of both factors; only the result's scale can move.
+        product = sum(frac_bits[name] for name in op.inputs)
+        frac_bits[op.output] = product - clamp(product - frac_bits[op.output], shifts.shift_cut)
+    elif ties_scales(op):
+        # Inputs and output have one scale: the coarsest of them, because a finer one clips, or
+        # that of the planes, which the host writes.
+        names = (*op.inputs, op.output)
+        shared = frac_bits[PLANES] if PLANES in names else min(frac_bits[n] for n in names)
+        frac_bits.update(dict.fromkeys(names, shared))
+    return op
 
 
-def _quantize_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts) -> IntConv:
-    # With finer weights the shift would be beyond its window, and the result's scale would have to
+def _quantize_conv(op: Conv, input_bits: int, output_bits: int, shifts: Shifts) -> RoundedConv:
+    """Round a convolution, whose input and output have these numbers of fractional bits; the
+    output's may change.
+    """
+    # With finer weights the shift would exceed its range, and the result's scale would have to
     # become finer too, so that it clips.
-    finest = shifts.cut[1] + frac_bits[op.output] - frac_bits[op.input]
-    weight_frac_bits = min(best_frac_bits(op.weight), finest)
+    _, largest = shifts.shift_cut
+    weight_frac_bits = min(best_frac_bits(op.weight), largest + output_bits - input_bits)
     # Here the end of int8 is the activation's own clip, so the result must keep its scale: the
     # weights are made fine enough for a shift of 0.
     if op.ceiling is not None:
-        weight_frac_bits = max(weight_frac_bits, frac_bits[op.output] - frac_bits[op.input])
-    product = weight_frac_bits + frac_bits[op.input]
-    cut = clamp(product - frac_bits[op.output], shifts.cut)
-    frac_bits[op.output] = product - cut
-    weight = quantize(op.weight, weight_frac_bits)
+        weight_frac_bits = max(weight_frac_bits, output_bits - input_bits)
+    product = weight_frac_bits + input_bits
+    output_bits = product - clamp(product - output_bits, shifts.shift_cut)
     bias, bias_frac_bits = quantize_bias(op.bias, product, shifts)
     # ReLU6 equals ReLU if int8 ends at six or below, as it does once `equalize` has scaled.
-    ends_first = op.ceiling is not None or INT8_MAX * 2.0 ** -frac_bits[op.output] <= SIX
+    ends_first = op.ceiling is not None or INT8_MAX * 2.0**-output_bits <= SIX
     is_relu = op.activation is Activation.relu6 and ends_first
-    return IntConv(
+    rounded = IntConv(
         op.name,
         op.input,
         op.output,
-        weight,
+        quantize(op.weight, weight_frac_bits),
         weight_frac_bits,
         bias,
         bias_frac_bits,
@@ -306,6 +312,7 @@ def _quantize_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts) -> IntCo
         op.groups,
         op.transposed,
     )
+    return RoundedConv(op, rounded, output_bits)
 
 
 def quantize_bias(bias: np.ndarray, product: int, shifts: Shifts) -> tuple[np.ndarray, int]:
@@ -323,7 +330,7 @@ def quantize_bias(bias: np.ndarray, product: int, shifts: Shifts) -> tuple[np.nd
     """
     # Any scale holds zeros; the accumulator's own needs no shift.
     best = best_frac_bits(bias) if bias.any() else product
-    frac_bits = product - clamp(product - best, shifts.bias)
+    frac_bits = product - clamp(product - best, shifts.shift_bias)
     return quantize(bias, frac_bits), frac_bits
 
 
@@ -340,41 +347,32 @@ def shift_faults(core: IntCore, shifts: Shifts = SHIFTS) -> list[str]:
     """
     faults = []
     for op in core.ops:
-        for rule, value, window in op_shifts(op, core.frac_bits, shifts):
-            if not window[0] <= value <= window[1]:
-                faults.append(f"{op.name}: {rule} is {value}, allowed {window[0]} to {window[1]}")
+        for rule, bits in op_shifts(op, core.frac_bits).items():
+            low, high = (0, 0) if ties_scales(op) else getattr(shifts, rule)
+            if not low <= bits <= high:
+                faults.append(f"{op.name}: {rule} is {bits}, allowed {low} to {high}")
     return faults
 
 
-def op_shifts(
-    op: IntConv | Op, frac_bits: Mapping[str, int], shifts: Shifts
-) -> list[tuple[str, int, tuple[int, int]]]:
-    """List the shifts that an operation needs, because its tensors have different scales.
+def op_shifts(op: IntConv | Op, frac_bits: Mapping[str, int]) -> dict[str, int]:
+    """Return the shifts in bits that an operation needs, because its tensors have different scales.
 
     Args:
         op: an operation of a core.
         frac_bits: the number of fractional bits of each tensor by its name.
-        shifts: the smallest and largest shifts that the target allows.
 
     Returns:
-        For each shift its name, such as "shift_cut"; its value in bits; and the smallest and the
-        largest value allowed.
+        The shifts by their names, which are those of `Shifts`.
     """
-    inputs = [frac_bits[i] for i in op.inputs]
+    inputs = [frac_bits[name] for name in op.inputs]
     output = frac_bits[op.output]
     if isinstance(op, Add):
-        spread = max(inputs) - min(inputs)
-        write = min(inputs) - output
-        return [("shift_read", spread, shifts.read), ("shift_write", write, shifts.write)]
+        return {"shift_read": max(inputs) - min(inputs), "shift_write": min(inputs) - output}
     if isinstance(op, Mul):
-        return [("shift_cut", sum(inputs) - output, shifts.cut)]
+        return {"shift_cut": sum(inputs) - output}
     if ties_scales(op):
-        spread = max(*inputs, output) - min(*inputs, output)
-        return [("shift_read", spread, (0, 0))]
+        return {"shift_read": max(*inputs, output) - min(*inputs, output)}
     if not isinstance(op, IntConv):
-        return []
+        return {}
     product = op.weight_frac_bits + inputs[0]
-    return [
-        ("shift_cut", product - output, shifts.cut),
-        ("shift_bias", product - op.bias_frac_bits, shifts.bias),
-    ]
+    return {"shift_cut": product - output, "shift_bias": product - op.bias_frac_bits}

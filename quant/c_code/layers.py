@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, op_shifts
+from beers_deploy.quant.core import IntConv, IntCore, op_shifts
 from beers_deploy.quant.graph import (
     Activation,
     Add,
@@ -95,7 +95,7 @@ class LayerWriter:
             f"{plain(name)} ({times(self.shapes[name])} in units of 2^{-bits[name]})"
             for name in (*op.inputs, op.output)
         ]
-        shifts = "".join(f", {name} {value}" for name, value, _ in op_shifts(op, bits, SHIFTS))
+        shifts = "".join(f", {name} {value}" for name, value in op_shifts(op, bits).items())
         kind = type(op).__name__
         if isinstance(op, IntConv):
             rows, columns = op.weight.shape[2:]

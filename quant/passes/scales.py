@@ -11,7 +11,7 @@ more, and one bit coarser, where it rounds more. The error of the result decides
    the end of int8 may represent its six.
 3. The scales of a convolution's weights and of its biases change separately. Those of copies do not
    change, because the coarse copy would have to change as well.
-4. A change is skipped if it leaves the DPU's shift windows, and undone if it does not reduce the
+4. A change is skipped if the DPU's shifts do not allow it, and undone if it does not reduce the
    error.
 """
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.instrument import MAX_DN
-from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, op_shifts
+from beers_deploy.quant.core import IntConv, IntCore, op_shifts
 from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
 from beers_deploy.quant.graph import PLANES, Activation, channels_of
 from beers_deploy.quant.integer.reference import NO_FAULTS, Faults, merged_correction, run_core
@@ -142,7 +142,7 @@ def shifts_of(core: IntCore) -> Shifts:
     """
     shifts: Shifts = {}
     for op in core.ops:
-        for field, value, _ in op_shifts(op, core.frac_bits, SHIFTS):
+        for field, value in op_shifts(op, core.frac_bits).items():
             if field != "shift_read":
                 shifts[op.name, field] = value
     return shifts

@@ -154,18 +154,18 @@ def test_where_relu6_clips_the_end_of_int8_stays() -> None:
         assert differing <= {CORRECTION}
 
 
-def test_a_window_of_shifts_is_kept() -> None:
-    """No move leaves a narrower window of shifts, as other targets have one."""
+def test_a_range_of_shifts_is_kept() -> None:
+    """No move leaves a narrower range of shifts, as other targets have one."""
     graph, core = chain(4)
     cuts = [
         op.weight_frac_bits + core.frac_bits[op.input] - core.frac_bits[op.output]
         for op in core.convolutions
     ]
     assert min(cuts) < max(cuts)
-    narrow = replace(SHIFTS, cut=(min(cuts), max(cuts)))
+    narrow = replace(SHIFTS, shift_cut=(min(cuts), max(cuts)))
     assert all(shift_faults(each, narrow) == [] for each in tried(core, graph, narrow))
-    # In a window of one shift no single scale can move.
-    assert tried(core, graph, replace(SHIFTS, cut=(min(cuts), min(cuts)))) == []
+    # In a range of one shift no single scale can move.
+    assert tried(core, graph, replace(SHIFTS, shift_cut=(min(cuts), min(cuts)))) == []
 
 
 def test_a_worse_core_is_not_kept() -> None:
