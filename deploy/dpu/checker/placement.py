@@ -129,11 +129,8 @@ class Placement:
         if not self.note:
             return self.failed
         operations = tuple(node.op for node in self.nodes)
-        starts = {node.op.output for node in self.nodes if node.device == "DPU"}
-        behind, before = (
-            _reached(operations, starts, forwards=forwards) for forwards in (True, False)
-        )
-        return tuple(node for node in self.failed if node.op.output in behind & before)
+        between = _computed_from(operations, self.core) & _leading_to(operations, self.core)
+        return tuple(node for node in self.failed if node.op.output in between)
 
     @property
     def core(self) -> tuple[Operation, ...]:
@@ -153,31 +150,30 @@ def place(network: SizedGraph, dpu: Dpu) -> Placement:
     """
     # A misspelt constant would silence the rule that it is for.
     require_known(dpu)
-    convolutions = (op for op in network.operations if op.kind in CONVOLUTIONS)
-    convolved = set(chain.from_iterable(op.outputs for op in convolutions))
-    behind, before = (
-        _reached(network.operations, convolved, forwards=forwards) for forwards in (True, False)
-    )
+    convolutions = [op for op in network.operations if op.kind in CONVOLUTIONS]
+    behind = _computed_from(network.operations, convolutions)
+    before = _leading_to(network.operations, convolutions)
     parts = _parts(network, behind, before)
-    pairs = zip(network.operations, parts, strict=True)
-    broken = [judge(op, dpu, network.quantized) if part == "dpu-core" else () for op, part in pairs]
-    # In a float file a cut at an end only costs time.
-    if not network.quantized:
-        cpu_results: set[str] = set()
-        for number, op in enumerate(network.operations):
-            trails = op.output not in before
-            reads = bool(cpu_results & set(op.inputs))
-            # After the last convolution, a node that reads a result of the CPU stays on the CPU, so
-            # that the tensor is not transferred again.
-            follows = trails and not broken[number] and parts[number] == "dpu-core" and reads
-            if follows:
-                parts[number] = "host-back"
-            if trails and (broken[number] or follows):
-                cpu_results |= set(op.outputs)
-    devices: list[Device] = ["CPU" if rules else "DPU" for rules in broken]
-    for number, part in enumerate(parts):
-        if part != "dpu-core":
-            devices[number] = "host"
+    broken: list[tuple[Broken, ...]] = []
+    devices: list[Device] = []
+    on_cpu: set[str] = set()
+    for number, op in enumerate(network.operations):
+        rules = judge(op, dpu, network.quantized) if parts[number] == "dpu-core" else ()
+        broken.append(rules)
+        if parts[number] != "dpu-core":
+            devices.append("host")
+            continue
+        # After the last convolution of a float file a cut only costs time. A node there that reads
+        # a result of the CPU stays on the CPU, so that the tensor is not transferred again.
+        trails = not network.quantized and op.output not in before
+        follows = trails and not rules and not on_cpu.isdisjoint(op.inputs)
+        if follows:
+            parts[number] = "host-back"
+            devices.append("host")
+        else:
+            devices.append("CPU" if rules else "DPU")
+        if trails and devices[-1] != "DPU":
+            on_cpu |= set(op.outputs)
     subgraphs = _subgraphs(network.operations, devices)
     nodes = tuple(map(PlacedNode, network.operations, parts, devices, broken, subgraphs))
     return Placement(nodes, tuple(_cuts(network, nodes)), "" if network.quantized else FLOAT_NOTE)
@@ -210,17 +206,21 @@ def _parts(network: SizedGraph, behind: set[str], before: set[str]) -> list[Part
     return parts
 
 
-def _reached(operations: Sequence[Operation], starts: set[str], *, forwards: bool) -> set[str]:
-    """Return the results that are computed from one of `starts` (forwards), or from which one is
-    computed. `starts` is included.
-    """
-    results: set[str] = set()
-    for op in operations if forwards else reversed(operations):
-        reads = op.inputs if forwards else op.outputs
-        if not results.isdisjoint(reads) or not starts.isdisjoint(op.outputs):
+def _computed_from(operations: Sequence[Operation], starts: Iterable[Operation]) -> set[str]:
+    """Return the results of some operations, and all results that are computed from these."""
+    results = set(chain.from_iterable(op.outputs for op in starts))
+    for op in operations:
+        if not results.isdisjoint(op.inputs):
             results |= set(op.outputs)
-            if not forwards:
-                results |= set(op.inputs)
+    return results
+
+
+def _leading_to(operations: Sequence[Operation], ends: Iterable[Operation]) -> set[str]:
+    """Return the results of some operations, and all results that these are computed from."""
+    results = set(chain.from_iterable(op.outputs for op in ends))
+    for op in reversed(operations):
+        if not results.isdisjoint(op.outputs):
+            results |= {*op.inputs, *op.outputs}
     return results
 
 
