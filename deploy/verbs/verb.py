@@ -165,23 +165,26 @@ def paths_of(function: Callable[..., Any], arguments: Mapping[str, Any]) -> Path
     parameters = signature(function).parameters
     paths = Paths([], [], [], [])
     for name, value in arguments.items():
-        written = marker(parameters[name], Written)
+        parameter = parameters[name]
+        written = marker(parameter, Written)
         is_path = isinstance(value, str | os.PathLike)
         if written is None:
             paths.inputs.extend(_paths_in(value))
-            if is_path and marker(parameters[name], Labelled) is not None:
+            if is_path and marker(parameter, Labelled) is not None:
                 below = Path(value).rglob("*")
                 paths.inputs.extend(path for path in below if path.suffix.lower() in LABELS)
         # Anything else is refused afterwards, when older verdicts are deleted.
         elif is_path:
-            holds = marker(parameters[name], Holds)
-            files = [Path(value)] if holds is None else [Path(value) / f for f in holds.files]
-            second = marker(parameters[name], NextTo)
+            # An output that is no folder is the file itself.
+            holds = marker(parameter, Holds) or Holds("")
+            files = [Path(value) / file for file in holds.files]
+            second = marker(parameter, NextTo)
             if second is not None and arguments.get(second.when):
                 files.append(Path(value).with_suffix(second.suffix))
             paths.outputs.extend(files)
-            paths.verdicts.extend(files if written.verdict else [])
-            paths.folders.extend([] if holds is None else [Path(value) / f for f in holds.folders])
+            paths.folders.extend(Path(value) / folder for folder in holds.folders)
+            if written.verdict:
+                paths.verdicts.extend(files)
     return paths
 
 
