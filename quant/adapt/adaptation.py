@@ -140,14 +140,13 @@ def adapt(model: onnx.ModelProto, samples: Patches, held_out: Patches) -> Adapte
         (chosen,) = trials.values()
     else:
         chosen = _trial(model, counts.keys() - exact, exact, images, held_out, inverses)
+    is_fitted = chosen.after is not chosen.before
+    how = "compensated" if is_fitted else "not compensated: no fit is nearer"
     rows = []
     for kind, count in counts.items():
+        becomes = f"{APPROXIMATIONS[kind]}, {how}"
         if kind in exact:
             becomes = f"{EXACT[kind]}, exactly"
-        else:
-            is_fitted = chosen.after is not chosen.before
-            how = "compensated" if is_fitted else "not compensated: no fit is nearer"
-            becomes = f"{APPROXIMATIONS[kind]}, {how}"
         figures = trials[kind].figures if kind in trials else {}
         rows.append(Row(ADAPTED, f"{count} {kind}", figures, {"becomes": becomes}))
     record = "; ".join(f"{row.name}: {row.text['becomes']}" for row in rows)

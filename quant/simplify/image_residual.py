@@ -39,19 +39,21 @@ def clip_last(graph: OnnxGraph, node: Node) -> Replacement:
     source, affine = affine_chain(graph, node.result)
     is_last = source == node.result
     clip = node if is_last else graph.sole_writer(source)
-    clipped, *limits, count = joint_limits(graph, clip)
-    is_limited = count > 0 and np.isfinite(limits).all()
-    if not is_limited or affine.channels > 1 or not affine.scale.all() or (is_last and count == 1):
+    clipping = joint_limits(graph, clip)
+    # Without a node the limits are infinite.
+    is_limited = np.isfinite(clipping.limits).all()
+    is_this = is_last and clipping.nodes == 1
+    if not is_limited or affine.channels > 1 or not affine.scale.all() or is_this:
         return None
     name = node.result
     # A negative scale exchanges the two limits.
-    low, high = sorted((affine.scale * limit + affine.shift).item() for limit in limits)
+    low, high = sorted((affine.scale * limit + affine.shift).item() for limit in clipping.limits)
     ends = [
         graph.add_constant(f"{name}.low", low),
         graph.add_constant(f"{name}.high", high),
     ]
-    nodes = [] if is_last else _scaled(graph, clipped, name, affine)
-    last = nodes[-1].result if nodes else clipped
+    nodes = [] if is_last else _scaled(graph, clipping.source, name, affine)
+    last = nodes[-1].result if nodes else clipping.source
     return [*nodes, Node.new("Clip", [last, *ends], name, clip.name)]
 
 

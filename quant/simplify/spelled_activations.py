@@ -11,6 +11,7 @@
 
 from collections.abc import Callable
 from math import pi, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
@@ -66,44 +67,58 @@ def join_clips(graph: OnnxGraph, node: Node) -> Replacement:
     ]
 
 
-def joint_limits(graph: OnnxGraph, node: Node) -> tuple[str, float, float, int]:
-    """Return what a node and those in front of it, which only clip, have in common.
+class Clipping(NamedTuple):
+    """What nodes that clip one after the other compute together.
+
+    Attributes:
+        source: the tensor that is clipped; "" without nodes.
+        low: the low limit.
+        high: the high limit.
+        nodes: the number of the nodes.
+    """
+
+    source: str = ""
+    low: float = -np.inf
+    high: float = np.inf
+    nodes: int = 0
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """The low and the high limit."""
+        return self.low, self.high
+
+
+def joint_limits(graph: OnnxGraph, node: Node) -> Clipping:
+    """Return what a node and those in front of it, which only clip, compute together.
 
     Args:
         graph: the graph that the node belongs to.
-        node: the last of the nodes; another node returns no name and a count of 0.
-
-    Returns:
-        The tensor that is clipped, its low and its high limit, and the number of nodes.
+        node: the last of the nodes; another node returns a clipping of 0 nodes.
     """
-    low = -np.inf
-    high = np.inf
-    source = ""
-    count = 0
-    while step := _limits(graph, node):
-        source, *limits = step
-        low, high = (float(np.clip(limit, low, high)) for limit in limits)
-        node = graph.sole_writer(source)
-        count += 1
-    return source, low, high, count
+    joint = Clipping()
+    while first := _clipping(graph, node):
+        low, high = np.clip(first.limits, *joint.limits).tolist()
+        joint = Clipping(first.source, low, high, joint.nodes + 1)
+        node = graph.sole_writer(first.source)
+    return joint
 
 
-def _limits(graph: OnnxGraph, node: Node) -> tuple[str, float, float] | None:
-    """Return the tensor that a node clips, and the low and the high limit; None for another."""
+def _clipping(graph: OnnxGraph, node: Node) -> Clipping | None:
+    """Return what a single node clips; None if it does not clip, or by computed limits."""
     if node.op_type == "Relu":
-        return node.source, 0.0, np.inf
+        return Clipping(node.source, low=0.0)
     if node.op_type == "Clip":
         source, low_name, high_name = (*node.inputs, "", "")[:3]
         low = _number(graph, low_name) if low_name else -np.inf
         high = _number(graph, high_name) if high_name else np.inf
         if low is None or high is None:
             return None
-        return source, low, high if high < UNLIMITED else np.inf
-    if node.op_type in ("Max", "Min") and len(node.inputs) == 2:
-        for source, name in node.orders:
-            if (limit := _number(graph, name)) is not None:
-                is_low = node.op_type == "Max"
-                return source, limit if is_low else -np.inf, np.inf if is_low else limit
+        return Clipping(source, low, high if high < UNLIMITED else np.inf)
+    is_binary = node.op_type in ("Max", "Min") and len(node.inputs) == 2
+    for source, name in node.orders if is_binary else ():
+        if (limit := _number(graph, name)) is not None:
+            by_max = node.op_type == "Max"
+            return Clipping(source, low=limit) if by_max else Clipping(source, high=limit)
     return None
 
 
@@ -235,8 +250,8 @@ def slope_and_offset(node: Node) -> tuple[float, float]:
 
 def _shifted_and_clipped(graph: OnnxGraph, name: str) -> str:
     """Return x if a tensor is x + 3, clipped from 0 to 6; else ""."""
-    source, *limits, _ = joint_limits(graph, graph.writer(name))
-    return other_operand(graph, source, "Add", 3) if limits == [0, 6] else ""
+    clipping = joint_limits(graph, graph.writer(name))
+    return other_operand(graph, clipping.source, "Add", 3) if clipping.limits == (0, 6) else ""
 
 
 def other_operand(graph: OnnxGraph, name: str, kind: str, number: float) -> str:
