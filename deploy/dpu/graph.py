@@ -2,7 +2,7 @@
 file, each with its kind and the shape of its result.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -78,54 +78,41 @@ def kind_of(node: Node, weight: np.ndarray | None) -> Kind:
     return "depthwise" if weight.shape[1] == 1 else "grouped conv"
 
 
-def out_shape(
-    node: Node,
-    kind: Kind,
-    shapes: Sequence[Shape | None],
-    kernel: Pair,
-    window: Window,
-    channels: int,
-    constants: Mapping[str, np.ndarray],
-) -> Shape | None:
-    """Infer the shape of the first output of a node.
+def out_shape(op: "Operation", node: Node, constants: Mapping[str, np.ndarray]) -> Shape | None:
+    """Infer the shape of the first output of an operation.
 
     Args:
-        node: the ONNX node.
-        kind: its kind of operation.
-        shapes: the shape (C, H, W) of each activation that the node reads; None if unknown.
-        kernel: height and width of the kernel of a convolution or pool.
-        window: strides, pads and dilations of the kernel.
-        channels: the number of output channels of a convolution or pool.
+        op: the operation, all of whose other properties are known.
+        node: the ONNX node that it was read from.
         constants: the constants of the file by name. Some operators read sizes from them.
 
     Returns:
         The shape (C, H, W); None if it cannot be inferred.
     """
-    inputs = [shape for shape in shapes if shape is not None]
-    if not inputs or len(inputs) != len(shapes):
+    inputs = [shape for shape in op.in_shapes if shape is not None]
+    if not inputs or len(inputs) != len(op.in_shapes):
         return None
     first = inputs[0]
-    if kind in WINDOWED:
-        ceil = bool(node.attributes.get("ceil_mode", 0))
+    if op.kind in WINDOWED:
         rows, columns = (
-            window.transposed_size(axis, kernel[axis], first[1 + axis]) + node.output_padding[axis]
-            if kind == "transposed"
-            else window.output_size(axis, kernel[axis], first[1 + axis], ceil)
-            for axis in (0, 1)
+            op.window.transposed_size(axis, side, size) + node.output_padding[axis]
+            if op.kind == "transposed"
+            else op.window.output_size(axis, side, size, bool(op.attributes.get("ceil_mode", 0)))
+            for axis, (side, size) in enumerate(zip(op.kernel, first[1:], strict=True))
         )
-        return (channels, rows, columns) if min(rows, columns) > 0 else None
-    if kind == "concat" and len(inputs) > 1:
-        joined = node.attributes["axis"] % 4
+        return (op.channels[1], rows, columns) if min(rows, columns) > 0 else None
+    if op.kind == "concat" and len(inputs) > 1:
         # ONNX counts the axis of the images too.
-        sides = [
-            sum(side) if axis == joined else side[0]
-            for axis, side in enumerate(zip(*inputs, strict=True), 1)
-        ]
-        return (sides[0], sides[1], sides[2])
-    if kind in ("add", "mul") or node.op_type == "Where":
+        joined = op.attributes["axis"] % 4 - 1
+        channels, rows, columns = (
+            sum(sides) if axis == joined else sides[0]
+            for axis, sides in enumerate(zip(*inputs, strict=True))
+        )
+        return (channels, rows, columns)
+    if op.kind in ("add", "mul") or op.op_type == "Where":
         channels, rows, columns = map(max, zip(*inputs, strict=True))
         return (channels, rows, columns)
-    if kind in ("activation", "quantize", "dequantize"):
+    if op.kind in ("activation", "quantize", "dequantize"):
         return first
     return _inferred(node, inputs, constants)
 

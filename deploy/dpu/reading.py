@@ -9,6 +9,7 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -194,10 +195,7 @@ def _sized(graph: OnnxGraph, inputs: dict[str, Shape]) -> SizedGraph:
         shapes = tuple(map(shape_of.get, sources))
         kernel, window = _window(node, weight, shapes)
         channels = _channels(node, weight, shapes)
-        shape = out_shape(node, kind, shapes, kernel, window, channels[1], graph.constants)
         outputs = tuple(integers.resolve(name) for name in node.outputs if name)
-        shape_of |= dict.fromkeys(outputs, shape)
-        kind_by_name |= dict.fromkeys(outputs, kind)
         operand = None
         # An element-wise operator with one activation has a constant operand.
         if len(sources) == 1 and (kind in ("add", "mul") or node.op_type in ("Sub", "Div")):
@@ -209,7 +207,6 @@ def _sized(graph: OnnxGraph, inputs: dict[str, Shape]) -> SizedGraph:
             inputs=sources,
             outputs=outputs,
             in_shapes=shapes,
-            out_shape=shape,
             kernel=kernel,
             window=window,
             channels=channels,
@@ -222,6 +219,9 @@ def _sized(graph: OnnxGraph, inputs: dict[str, Shape]) -> SizedGraph:
             disputed={role: scales for role, scales in formats.items() if len(scales) > 1},
             constants=integers.numbers(node),
         )
+        operation = replace(operation, out_shape=out_shape(operation, node, graph.constants))
+        shape_of |= dict.fromkeys(outputs, operation.out_shape)
+        kind_by_name |= dict.fromkeys(outputs, kind)
         operations.append(operation)
     network_outputs = tuple(map(integers.resolve, graph.outputs))
     return SizedGraph(tuple(operations), inputs, network_outputs, integers.present)
