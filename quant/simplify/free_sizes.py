@@ -256,26 +256,22 @@ def _expanded(graph: OnnxGraph, node: Node) -> Replacement:
     result = node.result
     before = graph.shapes[source]
     after = graph.shapes[result]
-    if before == after or _is_broadcast_anyway(graph, node):
+    # It has no effect on arithmetic that broadcasts to the same size anyway. The source of another
+    # Expand may be small itself, so it does not count.
+    large = {
+        name
+        for name, size in graph.shapes.items()
+        if size == after and graph.writer(name).op_type != "Expand"
+    }
+    is_broadcast_anyway = result not in graph.outputs and all(
+        reader.op_type in ("Add", "Mul", "Sub") and not large.isdisjoint(reader.inputs)
+        for reader in graph.readers[result]
+    )
+    if before == after or is_broadcast_anyway:
         return [node.replaced_by("Identity", [source])]
     if before[1] > 1 or before[2:] != after[2:]:
         return None
     return [graph.convolution(source, result, node.name, np.ones((after[1], 1, 1, 1)))]
-
-
-def _is_broadcast_anyway(graph: OnnxGraph, node: Node) -> bool:
-    """Return True if all readers of an Expand are arithmetic that broadcasts to the same size."""
-    result = node.result
-    # The source of another Expand may be small itself, so it does not count.
-    large = {
-        name
-        for name, size in graph.shapes.items()
-        if size == graph.shapes[result] and graph.writer(name).op_type != "Expand"
-    }
-    return result not in graph.outputs and all(
-        reader.op_type in ("Add", "Mul", "Sub") and not large.isdisjoint(reader.inputs)
-        for reader in graph.readers[result]
-    )
 
 
 def _with_written_maps(graph: OnnxGraph, node: Node) -> Replacement:
