@@ -217,23 +217,30 @@ def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fi
         )
         converged = ~astray & (gamma_change < CONVERGED)
         # Each edge has its own number of passes: converged edges leave the batch.
-        for k in np.flatnonzero(converged):
-            own_gamma = float(lines.gamma[k])
-            chi2 = float(chi2s[k])
-            step = float(steps[k])
-            count_px = int(mask[k].sum()) - 5
-            scatter = chi2 / count_px
-            misfit = math.sqrt(max(scatter - 1, 0.0)) / max(step, 1e-9)
-            # The rest may be smaller than the noise by chance, which makes no error smaller.
-            error = math.sqrt(float(variance[k]) * max(scatter, 1.0))
-            if misfit > limits.misfit or step < limits.step_sigma or error > limits.error:
-                continue
+        done = np.flatnonzero(converged)
+        counts = mask[done].sum(1) - 5
+        scatter = chi2s[done] / counts
+        misfits = np.sqrt(np.maximum(scatter - 1, 0)) / np.maximum(steps[done], 1e-9)
+        # The rest may be smaller than the noise by chance, which makes no error smaller.
+        errors = np.sqrt(variance[done] * np.maximum(scatter, 1))
+        refused = (misfits > limits.misfit) | (errors > limits.error)
+        refused |= steps[done] < limits.step_sigma
+        if limits is not ANY:
             # Sharper than a detector's pixel, or softer than any profile: no plain edge.
             least = 0.0 if shape else LEAST_GAMMA
-            if limits is ANY or least <= own_gamma < LARGEST_GAMMA:
-                line = (float(lines.slope[k]), float(lines.place[k]))
-                at = active[k]
-                fits[at] = EdgeBlur(own_gamma, error, *line, pixels[at], chi2, count_px)
+            refused |= (lines.gamma[done] < least) | (lines.gamma[done] >= LARGEST_GAMMA)
+        for n in np.flatnonzero(~refused):
+            k = done[n]
+            at = active[k]
+            fits[at] = EdgeBlur(
+                gamma=float(lines.gamma[k]),
+                error=float(errors[n]),
+                slope=float(lines.slope[k]),
+                place=float(lines.place[k]),
+                pixels=pixels[at],
+                chi2=float(chi2s[k]),
+                count=int(counts[n]),
+            )
         lines = lines.only(~astray & ~converged)
         active = active[~astray & ~converged]
         if not active.size:
