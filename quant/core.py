@@ -119,6 +119,15 @@ class IntConv(OneInput):
         """The real values (O,) float64 that the integer bias represents."""
         return self.bias * 2.0**-self.bias_frac_bits
 
+    def accumulator_bits(self, frac_bits: Mapping[str, int]) -> int:
+        """Return the number of fractional bits of the accumulator: those of the weights plus those
+        of the input.
+
+        Args:
+            frac_bits: the number of fractional bits of each tensor by its name.
+        """
+        return self.weight_frac_bits + frac_bits[self.input]
+
 
 @dataclass(frozen=True)
 class IntCore:
@@ -270,8 +279,8 @@ def _rounded(
         frac_bits[op.output] = coarse - clamp(coarse - frac_bits[op.output], shifts.shift_write)
     elif isinstance(op, Mul):
         # A product has the fractional bits of both factors; only the result's scale can move.
-        product = sum(frac_bits[name] for name in op.inputs)
-        frac_bits[op.output] = product - clamp(product - frac_bits[op.output], shifts.shift_cut)
+        both = sum(frac_bits[name] for name in op.inputs)
+        frac_bits[op.output] = both - clamp(both - frac_bits[op.output], shifts.shift_cut)
     elif ties_scales(op):
         # Inputs and output have one scale: the coarsest of them, because a finer one clips, or
         # that of the planes, which the host writes.
@@ -293,9 +302,9 @@ def _quantize_conv(op: Conv, input_bits: int, output_bits: int, shifts: Shifts) 
     # weights are made fine enough for a shift of 0.
     if op.ceiling is not None:
         weight_frac_bits = max(weight_frac_bits, output_bits - input_bits)
-    product = weight_frac_bits + input_bits
-    output_bits = product - clamp(product - output_bits, shifts.shift_cut)
-    bias, bias_frac_bits = quantize_bias(op.bias, product, shifts)
+    accumulator_bits = weight_frac_bits + input_bits
+    output_bits = accumulator_bits - clamp(accumulator_bits - output_bits, shifts.shift_cut)
+    bias, bias_frac_bits = quantize_bias(op.bias, accumulator_bits, shifts)
     # ReLU6 equals ReLU if int8 ends at six or below, as it does once `equalize` has scaled.
     ends_first = op.ceiling is not None or INT8_MAX * 2.0**-output_bits <= SIX
     is_relu = op.activation is Activation.relu6 and ends_first
@@ -315,22 +324,23 @@ def _quantize_conv(op: Conv, input_bits: int, output_bits: int, shifts: Shifts) 
     return RoundedConv(op, rounded, output_bits)
 
 
-def quantize_bias(bias: np.ndarray, product: int, shifts: Shifts) -> tuple[np.ndarray, int]:
+def quantize_bias(
+    bias: np.ndarray, accumulator_bits: int, shifts: Shifts
+) -> tuple[np.ndarray, int]:
     """Quantise a convolution's bias to int8, at a scale that a shift can align with the
     accumulator.
 
     Args:
         bias: (O,) the float bias.
-        product: the number of fractional bits of the accumulator: those of the weights plus those
-            of the input.
+        accumulator_bits: the number of fractional bits of the accumulator.
         shifts: the smallest and largest shifts that the target allows.
 
     Returns:
         The integers (O,) int8, and their number of fractional bits.
     """
     # Any scale holds zeros; the accumulator's own needs no shift.
-    best = best_frac_bits(bias) if bias.any() else product
-    frac_bits = product - clamp(product - best, shifts.shift_bias)
+    best = best_frac_bits(bias) if bias.any() else accumulator_bits
+    frac_bits = accumulator_bits - clamp(accumulator_bits - best, shifts.shift_bias)
     return quantize(bias, frac_bits), frac_bits
 
 
@@ -374,5 +384,5 @@ def op_shifts(op: IntConv | Op, frac_bits: Mapping[str, int]) -> dict[str, int]:
         return {"shift_read": max(*inputs, output) - min(*inputs, output)}
     if not isinstance(op, IntConv):
         return {}
-    product = op.weight_frac_bits + inputs[0]
-    return {"shift_cut": product - output, "shift_bias": product - op.bias_frac_bits}
+    accumulator = op.accumulator_bits(frac_bits)
+    return {"shift_cut": accumulator - output, "shift_bias": accumulator - op.bias_frac_bits}

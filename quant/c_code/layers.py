@@ -249,10 +249,9 @@ def _conv(w: LayerWriter, op: IntConv) -> None:
         weight = weight[:, :, ::-1, ::-1]
         rows, columns = (side - 1 for side in weight.shape[2:])
         window = Window(pads=(rows - window.pads[0], columns - window.pads[1], 0, 0))
-    product = op.weight_frac_bits + w.core.frac_bits[op.input]
+    shifts = op_shifts(op, w.core.frac_bits)
     # Sums start at the bias, so it must have their unit.
-    bias = accumulator_bias(op, product - op.bias_frac_bits)
-    cut = product - w.core.frac_bits[op.output]
+    bias = accumulator_bias(op, shifts["shift_bias"])
     layer = w.struct(
         "convolution",
         **_axes(window, weight.shape[2:]),
@@ -262,7 +261,13 @@ def _conv(w: LayerWriter, op: IntConv) -> None:
         # map.
         weight=w.array(np.int8, "weight", weight.transpose(0, 3, 2, 1)),
         bias=w.array(np.int32, "bias", bias),
-        rounding=w.rounding(op, cut, bound_of(op, bias), op.activation, product),
+        rounding=w.rounding(
+            op,
+            shifts["shift_cut"],
+            bound_of(op, bias),
+            op.activation,
+            op.accumulator_bits(w.core.frac_bits),
+        ),
     )
     w.call("convolve", layer, op)
     outputs, inputs, rows, columns = weight.shape
@@ -293,7 +298,7 @@ def _add(w: LayerWriter, op: Add) -> None:
 
 def _mul(w: LayerWriter, op: Mul) -> None:
     """Write a product of two tensors, whose fractional bits add up."""
-    shift = sum(w.core.frac_bits[name] for name in op.inputs) - w.core.frac_bits[op.output]
+    shift = op_shifts(op, w.core.frac_bits)["shift_cut"]
     # The largest product is that of -128 and -128.
     rounding = w.rounding(op, shift, 14.0)
     name = f"layer_{w.number}"

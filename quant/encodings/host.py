@@ -21,7 +21,7 @@ import numpy as np
 from onnx import ModelProto, TensorProto, helper
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.core import IntConv, IntCore, op_shifts
 from beers_deploy.quant.domains import MICROSOFT
 from beers_deploy.quant.encodings.checksum import CHECKSUM, checksum, is_damaged
 from beers_deploy.quant.encodings.description import KEY, describe, described_core, phases
@@ -151,7 +151,7 @@ def _conv(w: HostWriter, core: IntCore, op: IntConv) -> None:
 
 def _bias(core: IntCore, op: IntConv) -> np.ndarray:
     """Return the bias at the accumulator's scale, (O,) int32."""
-    shift = op.weight_frac_bits + core.frac_bits[op.input] - op.bias_frac_bits
+    shift = op_shifts(op, core.frac_bits)["shift_bias"]
     return accumulator_bias(op, shift).astype(np.int32)
 
 
@@ -204,7 +204,6 @@ def _clamp(w: HostWriter, frac_bits: Mapping[str, int], op: IntConv | Add) -> No
 def _leaky(w: HostWriter, core: IntCore, op: IntConv) -> None:
     """Write LeakyReLU as max(256 x, 26 x) of the int32 sums, exact in float64 and rounded once."""
     name = op.output
-    product = op.weight_frac_bits + core.frac_bits[op.input]
     feeds = [
         op.input,
         w.constant(f"{op.name}.weight", op.weight),
@@ -216,7 +215,7 @@ def _leaky(w: HostWriter, core: IntCore, op: IntConv) -> None:
     w.node("Add", f"{name}.sums", [f"{name}.products", bias])
     # Float64 holds products of int32 sums and 26 exactly, so that Round is the only rounding.
     w.node("Cast", f"{name}.wide", [f"{name}.sums"], to=TensorProto.DOUBLE)
-    unit = 2.0 ** (core.frac_bits[op.output] - product)
+    unit = 2.0 ** -op_shifts(op, core.frac_bits)["shift_cut"]
     for kind, factor in {"whole": unit, "leaking": LEAKY_SLOPE * unit}.items():
         by = w.constant(f"{op.name}.{kind}", np.array(factor, np.float64))
         w.node("Mul", f"{name}.{kind}", [f"{name}.wide", by])

@@ -12,10 +12,11 @@ that both can be proven and counted.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
-from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.core import IntConv, IntCore, op_shifts
 from beers_deploy.quant.frac_bits import INT8_MAX, INT8_MIN
 from beers_deploy.quant.graph import (
     CORRECTION,
@@ -111,15 +112,15 @@ def run_core(
     tensors = {PLANES: faults.touch(PLANES, planes.astype(np.int16))}
     reports = []
     for op in core.ops:
-        sums, shift, bound, finer = layer_sums(core, op, tensors, faults)
-        quotients, ties = rounded(sums, shift, half_even)
+        sums = layer_sums(core, op, tensors, faults)
+        quotients, ties = rounded(sums.values, sums.shift, half_even)
         result = saturated(quotients)
         tensors[op.output] = faults.touch(op.output, result)
         ends = (result == INT8_MAX) | (result == INT8_MIN)
-        largest = max(int(np.abs(sums).max()), 1)
+        largest = max(int(np.abs(sums.values).max()), 1)
         # An activation appends its bits behind the accumulator, which never holds them.
-        peak = max(float(np.log2(largest)) - finer, 0.0)
-        reports.append(LayerReport(op.name, peak, bound, float(ends.mean()), ties))
+        peak = max(float(np.log2(largest)) - sums.finer, 0.0)
+        reports.append(LayerReport(op.name, peak, sums.bound, float(ends.mean()), ties))
     return tensors, reports
 
 
@@ -138,10 +139,22 @@ def merged_correction(core: IntCore, tensors: Mapping[str, np.ndarray]) -> np.nd
     return core.host_part.decode(tensors[CORRECTION] * np.float32(scale), scale)
 
 
-Sums = tuple[np.ndarray, int, float, int]
-"""Sums (N, O, H, W) int64, the shift to int8, the bits that accumulators cannot exceed, and by how
-many more fractional bits an activation has made these sums longer than the accumulators were.
-"""
+class Sums(NamedTuple):
+    """The integer sums of an operation, before they are shifted and rounded to int8.
+
+    Attributes:
+        values: the sums (N, C, H, W).
+        shift: the right shift in bits that leads to int8.
+        bound: the number of bits, without the sign, that the accumulators cannot exceed.
+        finer: the number of fractional bits by which an activation has made the sums longer than
+            the accumulators were.
+    """
+
+    values: np.ndarray
+    shift: int
+    bound: float
+    finer: int = 0
+
 
 INT8_BITS = 7.0
 """The number of bits of values that are only moved, without the sign."""
@@ -157,11 +170,6 @@ def layer_sums(
         op: the operation.
         tensors: int8 values by tensor name, with those that the operation reads.
         faults: shifts that are replaced by wrong ones, to simulate faults.
-
-    Returns:
-        The sums (N, C, H, W); the right shift that leads to int8; the number of bits, without the
-        sign, that the accumulators cannot exceed; and the number of fractional bits that an
-        activation added to the sums.
     """
     inputs = [tensors[name] for name in op.inputs]
     if isinstance(op, IntConv):
@@ -170,16 +178,16 @@ def layer_sums(
         return _add(core, op, inputs, faults)
     if isinstance(op, Mul):
         product = inputs[0].astype(np.int64) * inputs[1]
-        shift = sum(core.frac_bits[name] for name in op.inputs) - core.frac_bits[op.output]
+        shift = op_shifts(op, core.frac_bits)["shift_cut"]
         # The largest product is that of -128 and -128, which is 2^14.
-        return product, shift, 14.0, 0
+        return Sums(product, shift, bound=14.0)
     if isinstance(op, AveragePool):
-        return *means(inputs[0], op), 0
+        return Sums(*means(inputs[0], op))
     if isinstance(op, Resize) and op.bilinear:
-        return *enlarged(inputs[0], op.factor), 0
+        return Sums(*enlarged(inputs[0], op.factor))
     # Values that only move have the same scale, and a table's entries are rounded, so no shift
     # remains.
-    return _moving(core, op, inputs), 0, INT8_BITS, 0
+    return Sums(_moving(core, op, inputs), 0, INT8_BITS)
 
 
 def _moving(core: IntCore, op: Op, inputs: list[np.ndarray]) -> np.ndarray:
@@ -198,14 +206,14 @@ def _moving(core: IntCore, op: Op, inputs: list[np.ndarray]) -> np.ndarray:
 
 
 def _conv(core: IntCore, op: IntConv, image: np.ndarray, faults: Faults) -> Sums:
-    product = op.weight_frac_bits + core.frac_bits[op.input]
-    shift = faults.shifts.get((op.name, "shift_bias"), product - op.bias_frac_bits)
+    needed = op_shifts(op, core.frac_bits)
+    shift = faults.shifts.get((op.name, "shift_bias"), needed["shift_bias"])
     bias = accumulator_bias(op, shift)
     sums = convolve(image, op.weight, op.window, op.groups, op.transposed) + bias[:, None, None]
     # The DPU applies the activation to the accumulator, before the one rounding.
-    sums, finer = activated(sums, op.activation, product)
-    cut = faults.shifts.get((op.name, "shift_cut"), product - core.frac_bits[op.output])
-    return sums, cut + finer, bound_of(op, bias), finer
+    sums, finer = activated(sums, op.activation, op.accumulator_bits(core.frac_bits))
+    cut = faults.shifts.get((op.name, "shift_cut"), needed["shift_cut"])
+    return Sums(sums, cut + finer, bound_of(op, bias), finer)
 
 
 def _add(core: IntCore, op: Add, inputs: list[np.ndarray], faults: Faults) -> Sums:
@@ -220,8 +228,9 @@ def _add(core: IntCore, op: Add, inputs: list[np.ndarray], faults: Faults) -> Su
     # An int8 value is at most 128 in size.
     bound = sum(128 << shift for shift in shifts)
     coarsest = min(core.frac_bits[name] for name in op.inputs)
-    write = faults.shifts.get((op.name, "shift_write"), coarsest - core.frac_bits[op.output])
-    return sums, finest - coarsest + write + finer, float(np.log2(bound)), finer
+    needed = op_shifts(op, core.frac_bits)["shift_write"]
+    write = faults.shifts.get((op.name, "shift_write"), needed)
+    return Sums(sums, finest - coarsest + write + finer, float(np.log2(bound)), finer)
 
 
 def rounded(sums: np.ndarray, shift: int, half_even: bool) -> tuple[np.ndarray, float]:

@@ -189,7 +189,7 @@ class TrainableCore(torch.nn.Module):
         frac_bits = self._core.frac_bits[op.output]
         # Scaled parameters give sums in the result's unit, which saves a pass over the sums. The
         # factors are powers of two, so float32 stays exact.
-        unit = 2.0 ** (frac_bits - op.weight_frac_bits - self._core.frac_bits[op.input])
+        unit = 2.0 ** (frac_bits - op.accumulator_bits(self._core.frac_bits))
         bias_unit = 2.0 ** (frac_bits - op.bias_frac_bits)
         weight = to_int8(weight) * unit
         if op.output == CORRECTION and decoding.copies > 1:

@@ -103,14 +103,13 @@ class ConditionedCore:
         if not (isinstance(op, IntConv) and op.name in self.biases):
             return op
         terms = self.biases[op.name]
-        product = op.weight_frac_bits + self.core.frac_bits[op.input]
         # Only the convolution behind the bank has a term for each of the sensor's values.
         real = terms @ values[: terms.shape[1]]
         if op.input == BANK:
             # The image comes first among the bank's channels, one for each pixel of a place.
             image = op.weight[:, : self.core.host_part.place_px**2].sum((1, 2, 3), dtype=np.int64)
             real += image_steps * image * 2.0 ** -(op.weight_frac_bits + BITS)
-        bias, bits = quantize_bias(real, product, self.shifts)
+        bias, bits = quantize_bias(real, op.accumulator_bits(self.core.frac_bits), self.shifts)
         return replace(op, bias=bias, bias_frac_bits=bits)
 
     def biases_to_json(self) -> str:

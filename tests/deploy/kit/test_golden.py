@@ -85,7 +85,7 @@ def board(core: IntCore, planes: np.ndarray, half_even: bool = False) -> dict[st
     """Return every tensor as a board writes it."""
     tensors = {PLANES: planes.astype(np.int16)}
     for op in core.ops:
-        sums, shift, _, _ = layer_sums(core, op, tensors)
+        sums, shift, *_ = layer_sums(core, op, tensors)
         values, _ = rounded(sums, shift, half_even)
         tensors[op.output] = saturated(values)
     return tensors
