@@ -28,7 +28,7 @@ from beers_deploy.model.family import noise_over_full_scale
 from beers_deploy.model.levels import LEVELS, Level
 from beers_deploy.model.simulator.mtf import mtf, sensor_mtf
 from beers_deploy.profiles.errors import ModelError, OptionError, printable, reason_of
-from beers_deploy.profiles.instrument import Instrument, noise_variances
+from beers_deploy.profiles.instrument import Instrument, PixelNoise, pixel_noise
 from beers_deploy.profiles.json_text import parse_json
 from beers_deploy.profiles.response import NYQUIST, Array
 
@@ -179,8 +179,7 @@ class PixelInterval:
                 "for that level. Choose one of these, or calibrate on more images."
             )
         return HalfWidth(
-            variances=noise_variances(sensor, full_scale),
-            offset=sensor.offset_dn * full_scale / sensor.max_dn,
+            noise=pixel_noise(sensor, full_scale),
             conditions=Conditions.of(sensor, full_scale),
             exponents=self.exponents,
             quantile=self.quantiles[level],
@@ -230,16 +229,14 @@ class HalfWidth:
     """The half-width of pixels of one sensor at one level.
 
     Attributes:
-        variances: the variances of the noise, see `profiles.instrument.noise_variances`.
-        offset: the pixel value of the dark.
+        noise: the noise of a pixel of the raw image.
         conditions: those that the sensor sets.
         exponents: how the half-width grows with them, with noise and with detail.
         quantile: the factor of the level.
         most: the largest half-width: no error exceeds full scale.
     """
 
-    variances: tuple[float, float, float]
-    offset: float
+    noise: PixelNoise
     conditions: Conditions
     exponents: Exponents
     quantile: float
@@ -256,16 +253,13 @@ class HalfWidth:
         Returns:
             (h, w) half-widths, NaN where a pixel is missing.
         """
-        noise, detail = noise_and_detail(restored, known, self.variances, self.offset)
+        noise, detail = noise_and_detail(restored, known, self.noise)
         half = self.quantile * self.exponents.half_widths(self.conditions, noise, detail)
         return np.where(known, np.minimum(half, self.most), np.nan).astype(np.float32)
 
 
 def noise_and_detail(
-    restored: NDArray[Any],
-    known: NDArray[np.bool_],
-    variances: tuple[float, float, float],
-    offset: float,
+    restored: NDArray[Any], known: NDArray[np.bool_], noise: PixelNoise
 ) -> tuple[Array, Array]:
     """Compute the noise and the local detail of every pixel, (h, w) each.
 
@@ -277,18 +271,15 @@ def noise_and_detail(
     Args:
         restored: (h, w) pixel values as they are stored.
         known: (h, w), False for missing pixels.
-        variances: the variances of the noise, see `HalfWidth`.
-        offset: the pixel value of the dark.
+        noise: the noise of a pixel of the raw image.
     """
     pixels = np.where(known, restored, 0).astype(np.float64)
     count = np.maximum(_window_sums(known.astype(np.float64)), 1)
     mean = _window_sums(pixels) / count
     variance = np.maximum(_window_sums(pixels**2) / count - mean**2, 0)
-    dark, growth, square = variances
-    light = np.maximum(mean - offset, 0)
-    noise = dark + growth * light + square * light**2
-    detail = np.sqrt(np.maximum(variance / noise, LEAST_DETAIL**2))
-    return np.sqrt(noise), detail
+    expected = noise.variance(mean)
+    detail = np.sqrt(np.maximum(variance / expected, LEAST_DETAIL**2))
+    return np.sqrt(expected), detail
 
 
 def _window_sums(values: Array) -> Array:

@@ -30,7 +30,7 @@ from beers_deploy.model.interval import (
 )
 from beers_deploy.model.levels import LEVELS
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.instrument import Instrument, noise_variances
+from beers_deploy.profiles.instrument import Instrument, pixel_noise
 from beers_deploy.profiles.response import Array
 
 LEAST_ERROR = 0.02
@@ -83,9 +83,9 @@ class Sample:
             truth: the image that the restoration aims at.
             sensor: the instrument.
         """
-        variances = noise_variances(sensor, sensor.max_dn)
         known = np.ones(restored.shape, bool)
-        noise, detail = noise_and_detail(restored, known, variances, sensor.offset_dn)
+        expected = pixel_noise(sensor, sensor.max_dn)
+        noise, detail = noise_and_detail(restored, known, expected)
         counts = np.zeros(raw.shape, bool)
         counts[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = True
         counts &= raw < sensor.max_dn

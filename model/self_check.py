@@ -39,7 +39,7 @@ from scipy.ndimage import distance_transform_edt, maximum_filter
 
 from beers_deploy.model.consistency.blocks import Image, Placed
 from beers_deploy.model.consistency.step import blur_between, centre
-from beers_deploy.profiles.instrument import Instrument, noise_variances
+from beers_deploy.profiles.instrument import Instrument, PixelNoise, pixel_noise
 from beers_deploy.profiles.response import Array
 
 BLOCK_PX = 64
@@ -125,16 +125,13 @@ class SelfCheck:
         rows: the filters along rows, (terms, 2 REACH_PX + 1). The kernel of the blur H is the sum
             over the terms of the product of a row filter and a column filter.
         columns: the filters along columns, of the same shape.
-        variances: the variances of the noise in squared pixel values: in the dark, its growth with
-            the light, and its growth with the squared light.
-        offset: the pixel value of the dark.
+        noise: the noise of a pixel, with that of a column added up over the rows of a cell.
         full_scale: the pixel value at and above which a raw pixel is saturated.
     """
 
     rows: Image
     columns: Image
-    variances: tuple[float, float, float]
-    offset: float
+    noise: PixelNoise
     full_scale: float
 
     @classmethod
@@ -160,8 +157,7 @@ class SelfCheck:
         return cls(
             rows=(left[:, :terms] * values[:terms]).T.astype(np.float32),
             columns=right[:terms].astype(np.float32),
-            variances=noise_variances(sensor, scale, patterns=2 * CELL_PX),
-            offset=sensor.offset_dn * scale / sensor.max_dn,
+            noise=pixel_noise(sensor, scale, patterns=2 * CELL_PX),
             full_scale=float(scale),
         )
 
@@ -199,26 +195,17 @@ class SelfCheck:
         spectrum = np.fft.rfft2(wide) * np.fft.rfft2(kernel, wide.shape)
         blurred = np.fft.irfft2(spectrum, wide.shape)[2 * REACH_PX :, 2 * REACH_PX :]
 
-        inside = tuple(
-            slice(placed.keep_start - placed.start, placed.keep_stop - placed.start)
-            for placed in (down, across)
-        )
+        inside = down.kept, across.kept
         excluded = missing | (raw >= self.full_scale)
         if excluded.any():
             excluded = maximum_filter(excluded, 2 * NEAR_PX + 1, mode="constant")
         # Only the image's own border is excluded, so that tiles give the same figures as the whole
         # image.
-        counts = ~excluded[inside]
-        counts[: max(NEAR_PX - down.keep_start, 0)] = False
-        counts[max(down.size_px - NEAR_PX - down.keep_start, 0) :] = False
-        counts[:, : max(NEAR_PX - across.keep_start, 0)] = False
-        counts[:, max(across.size_px - NEAR_PX - across.keep_start, 0) :] = False
+        counts = ~excluded[inside] & down.beyond(NEAR_PX)[:, None] & across.beyond(NEAR_PX)
         y = np.where(counts, raw[inside], 0)
-        dark, growth, square = self.variances
         # The variance is taken at the light of H x. The noise of y is in the residual as well, so
         # that its own light would bias the quotient.
-        light = np.maximum(blurred - self.offset, 0)
-        variance = dark + growth * light + square * light**2
+        variance = self.noise.variance(blurred)
         pixels = _sums(counts, BLOCK_PX)
         residual = np.where(counts, (y - blurred) / np.sqrt(variance), 0)
         cells, smooth = (

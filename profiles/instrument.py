@@ -3,7 +3,10 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from beers_deploy.profiles.effects import Dsnu, Effect, Prnu, Striping, Table
 from beers_deploy.profiles.response import PointSpread, Response
@@ -211,15 +214,33 @@ def snr_0_bounds(radiance_0: float, radiance_1: float, snr_1: float) -> tuple[fl
     return snr_1 * ratio, snr_1 * math.sqrt(ratio)
 
 
-def noise_variances(
-    sensor: Instrument, full_scale: float, patterns: float = 1
-) -> tuple[float, float, float]:
-    """Return the numbers a, b and c of the variance a + b x + c x^2 of a pixel's noise.
+class PixelNoise(NamedTuple):
+    """The noise of a pixel. Its variance is dark + growth x + square x^2, with x the pixel value
+    less that of the dark.
 
-    x is the pixel value less that of the dark. a is in squared pixel values, b in pixel values.
+    Attributes:
+        dark: the variance in the dark, in squared pixel values.
+        growth: its growth with the light, in pixel values.
+        square: its growth with the squared light.
+        offset: the pixel value of the dark.
+    """
+
+    dark: float
+    growth: float
+    square: float
+    offset: float
+
+    def variance(self, pixels: NDArray[Any]) -> NDArray[Any]:
+        """Return the variance at pixel values of any shape, in their floating-point type."""
+        light = np.maximum(pixels - self.offset, 0)
+        return np.asarray(self.dark + self.growth * light + self.square * light**2)
+
+
+def pixel_noise(sensor: Instrument, full_scale: float, patterns: float = 1) -> PixelNoise:
+    """Return the noise of a sensor's pixels.
 
     The differences of detectors that a profile states count as noise, because no single one of them
-    is known. 1/12 DN^2, the variance of rounding to integers, is a part of a.
+    is known. 1/12 DN^2, the variance of rounding to integers, is a part of that in the dark.
 
     Args:
         sensor: the instrument.
@@ -238,4 +259,5 @@ def noise_variances(
             dark += (effect.odd_even_dn / 2) ** 2
         elif isinstance(effect, Prnu):
             square = patterns * effect.rms**2
-    return dark * unit**2, sensor.alpha * gain * unit, square
+    growth = sensor.alpha * gain * unit
+    return PixelNoise(dark * unit**2, growth, square, sensor.offset_dn * full_scale / sensor.max_dn)

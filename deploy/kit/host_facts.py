@@ -72,7 +72,7 @@ def host_facts(
         self_check = {
             "rows": check.rows.tolist(),
             "columns": check.columns.tolist(),
-            "variances": list(check.variances),
+            "variances": check.noise[:3],
             "cell": CELL_PX,
             "smooth": SMOOTH_PX,
             "smooth_weight": SMOOTH_WEIGHT,
@@ -188,6 +188,6 @@ def consistency_facts(network: Network, sensor: Sensor) -> Facts | None:
     return {
         **{name: getattr(step, name).tolist() for name in names},
         "window_px": WINDOW_PX,
-        "variances": list(step.smoothing.variances),
+        "variances": step.smoothing.noise[:3],
         "detail": detail and {"rows": detail.rows.tolist(), "columns": detail.columns.tolist()},
     }

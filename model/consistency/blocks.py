@@ -63,6 +63,18 @@ class Placed:
         return min(max(first, low), high), max(min(last, high), low)
 
     @property
+    def kept(self) -> slice:
+        """The pixels of the result in the array."""
+        return slice(self.keep_start - self.start, self.keep_stop - self.start)
+
+    def beyond(self, border_px: int) -> NDArray[np.bool_]:
+        """Return True for each pixel of the result with `border_px` pixels or more to either end of
+        the image.
+        """
+        pixels = np.arange(self.keep_start, self.keep_stop)
+        return (pixels >= border_px) & (pixels < self.size_px - border_px)
+
+    @property
     def inside(self) -> NDArray[np.float32]:
         """1 for each pixel of the result within the blocks that count, 0 at the image's border."""
         start, stop = self.span(0)

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beers_deploy.model.consistency.blocks import Image, weighted_sums
-from beers_deploy.profiles.instrument import Instrument, noise_variances
+from beers_deploy.profiles.instrument import Instrument, PixelNoise, pixel_noise
 
 WINDOW_PX = 3
 """Side of a window. One of 5 pixels gains as much and takes longer (measured)."""
@@ -53,13 +53,10 @@ class Smoothing:
     """The step that smooths the restored images of one sensor.
 
     Attributes:
-        variances: the numbers a, b and c of n = a + b l + c l^2, 0 if that is negative, where l is
-            the light: the pixel value less that of the dark. a is in squared pixel values.
-        offset: the pixel value of the dark.
+        noise: the variance n, which counts as 0 where it is negative.
     """
 
-    variances: tuple[float, float, float]
-    offset: float
+    noise: PixelNoise
 
     @classmethod
     def of(cls, sensor: Instrument, full_scale: float) -> "Smoothing":
@@ -69,9 +66,9 @@ class Smoothing:
             sensor: the instrument that acquired the raw images.
             full_scale: the pixel value that is the sensor's largest digital number.
         """
-        dark, growth, square = noise_variances(sensor, full_scale)
-        variances = SHARE * dark, SHARE * growth, SHARE * (square - 1 / LIGHT**2)
-        return cls(variances, sensor.offset_dn * full_scale / sensor.max_dn)
+        dark, growth, square, offset = pixel_noise(sensor, full_scale)
+        square -= 1 / LIGHT**2
+        return cls(PixelNoise(SHARE * dark, SHARE * growth, SHARE * square, offset))
 
     def smoothed(self, restored: Image) -> Image:
         """Return smoothed pixels, (h, w) float32; `restored` itself if it has no dark pixel.
@@ -83,25 +80,19 @@ class Smoothing:
             restored: pixels (h, w), NaN where one is missing. They are mirrored beyond the array,
                 so that the outer SMOOTH_PX pixels are right at the border of the image only.
         """
-        least = np.fmin.reduce(restored, axis=None)
+        least = np.fmin.reduce(restored, axis=None, keepdims=True)
         # But for rounding, no mean is below the smallest pixel, so that no window would change.
-        if not self._noise(least * np.float32(0.99)) > 0:
+        if not self.noise.variance(least * np.float32(0.99)) > 0:
             return restored
         x = np.pad(restored, SMOOTH_PX, "symmetric")
         m = _means(x)
-        n = self._noise(m)
+        n = np.maximum(self.noise.variance(m), np.float32(0))
         v = _means(x * x) - m * m
         # 1 - a, which is exactly 0 without noise: then x' is exactly x.
         rest = np.asarray(n / np.maximum(np.maximum(v, n), np.float32(1e-30)), np.float32)
         around = x[SMOOTH_PX:-SMOOTH_PX, SMOOTH_PX:-SMOOTH_PX]
         result = around - _means(rest) * around + _means(rest * m)
         return np.where(np.isnan(result), around, result)
-
-    def _noise(self, pixels: Image | np.float32) -> Image:
-        """Return n for pixel values of any shape."""
-        dark, growth, square = map(np.float32, self.variances)
-        light = np.maximum(pixels - np.float32(self.offset), np.float32(0))
-        return np.maximum(dark + growth * light + square * light**2, np.float32(0))
 
 
 def _means(values: Image) -> NDArray[np.float32]:

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from beers_deploy.model.family import noise_over_full_scale
 from beers_deploy.model.interval import LEAST_DETAIL, MIDDLE_NOISE, PixelInterval
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.profiles.instrument import noise_variances
+from beers_deploy.profiles.instrument import pixel_noise
 from tests.model.exponents import EXPONENTS
 from tests.model.simulator.stages import NOMINAL
 
@@ -26,7 +26,7 @@ def test_half_widths_follow_the_formula_and_the_units() -> None:
     known = np.ones(pixels.shape, bool)
     half = INTERVAL.for_sensor(NOMINAL, MAX_DN, 90).of(pixels, known)
     window = pixels[3:6, 4:7].astype(np.float64)
-    dark, growth, square = noise_variances(NOMINAL, MAX_DN)
+    dark, growth, square, _ = pixel_noise(NOMINAL, MAX_DN)
     light = window.mean()
     sigma = math.sqrt(dark + growth * light + square * light**2)
     middle = noise_over_full_scale(NOMINAL) * MAX_DN
@@ -69,7 +69,7 @@ def test_flat_ground_has_a_width_and_none_exceeds_full_scale() -> None:
     flat = np.full((5, 5), 1000, np.uint16)
     width = INTERVAL.for_sensor(NOMINAL, MAX_DN, 90)
     half = width.of(flat, np.ones(flat.shape, bool))
-    dark, growth, _ = noise_variances(NOMINAL, MAX_DN)
+    dark, growth, *_ = pixel_noise(NOMINAL, MAX_DN)
     sigma = math.sqrt(dark + growth * 1000)
     least = EXPONENTS.half_widths(width.conditions, np.array(sigma), np.array(LEAST_DETAIL))
     assert half[2, 2] == pytest.approx(1.8 * least)

@@ -6,7 +6,7 @@ from numpy.testing import assert_array_equal
 
 from beers_deploy.model.consistency.smooth import LIGHT, SMOOTH_PX, Smoothing
 from beers_deploy.profiles.effects import Offset
-from beers_deploy.profiles.instrument import noise_variances
+from beers_deploy.profiles.instrument import pixel_noise
 from tests.model.consistency.images import FULL_SCALE
 from tests.model.simulator.stages import NOMINAL, plain_sensor
 
@@ -18,7 +18,7 @@ LEFT = 0.15
 
 def sigma_dn(light_dn: float) -> float:
     """Return the deviation of the raw image's noise at a light."""
-    dark, growth, _ = noise_variances(NOMINAL, FULL_SCALE)
+    dark, growth, *_ = pixel_noise(NOMINAL, FULL_SCALE)
     return float(np.sqrt(dark + growth * light_dn))
 
 
