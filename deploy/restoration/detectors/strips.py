@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -129,10 +130,24 @@ def value_steps(source: Source) -> list[float]:
     return [float(max(int(np.gcd.reduce(band.astype(np.int64), axis=None)), 1)) for band in rows]
 
 
-StripMeasures = tuple[Blocks, Blocks, range, list[tuple[np.ndarray, np.ndarray]], np.ndarray, int]
-"""The measurements in one strip of a band: columns, rows, the numbers of the rows in the image,
-patterns of two pixels, places of wrong pixels, and the number of known pixels.
-"""
+class StripMeasures(NamedTuple):
+    """The measurements in one strip of a band.
+
+    Attributes:
+        columns: the measurements of the columns.
+        rows: the measurements of the rows.
+        numbers: the numbers of the rows in the image.
+        phases: the patterns of two pixels, one for each section.
+        pixels: row and column in the image, (n, 2), of wrong pixels.
+        checked_px: the number of pixels that are not missing.
+    """
+
+    columns: Blocks
+    rows: Blocks
+    numbers: range
+    phases: list[tuple[np.ndarray, np.ndarray]]
+    pixels: np.ndarray
+    checked_px: int
 
 
 def _measured(
@@ -164,26 +179,25 @@ def _measured(
         phases.append(measure_phases(pixels[within, section], inner[:, section]))
     places = wrong_pixels(pixels, step)
     inside = (places[:, 0] >= within.start) & (places[:, 0] < within.stop)
-    return (
-        measure_lines(pixels[within], inner),
-        join_blocks(rows),
-        range(top + within.start, top + within.stop),
-        phases,
-        places[inside] + np.array([top, 0]),
-        int(np.isfinite(pixels[within]).sum()),
+    return StripMeasures(
+        columns=measure_lines(pixels[within], inner),
+        rows=join_blocks(rows),
+        numbers=range(top + within.start, top + within.stop),
+        phases=phases,
+        pixels=places[inside] + np.array([top, 0]),
+        checked_px=int(np.isfinite(pixels[within]).sum()),
     )
 
 
 def _judged(strips: Sequence[StripMeasures]) -> BandFaults:
     """Evaluate all strips of a band together, and return the faults of the band."""
-    columns, rows, numbers, phases, pixels, checked_px = zip(*strips, strict=True)
-    row_stripes = judge_lines(join_blocks(rows, axis=1), LEAST)
+    rows = judge_lines(join_blocks([strip.rows for strip in strips], axis=1), LEAST)
     return BandFaults(
-        columns=judge_lines(join_blocks(columns), LEAST),
-        rows=row_stripes.renumbered(list(chain.from_iterable(numbers))),
-        patterns=judge_phases(list(chain.from_iterable(phases)), LEAST),
-        pixels=np.concatenate(pixels),
-        checked_px=sum(checked_px),
+        columns=judge_lines(join_blocks([strip.columns for strip in strips]), LEAST),
+        rows=rows.renumbered(list(chain.from_iterable(strip.numbers for strip in strips))),
+        patterns=judge_phases(list(chain.from_iterable(s.phases for s in strips)), LEAST),
+        pixels=np.concatenate([strip.pixels for strip in strips]),
+        checked_px=sum(strip.checked_px for strip in strips),
     )
 
 
