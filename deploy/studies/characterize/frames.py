@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -109,12 +110,13 @@ def open_frames(images: Sequence[Path], bits: int | None, black_level: float | N
             "One of the `images` is given twice, but the same pixels add no information. Give "
             "each image once."
         )
-    own_steps, largest, piled, darkest, middles = zip(*map(_look, paths), strict=True)
-    step = int(np.gcd.reduce(own_steps))
-    bit_count = _settled_bits(bits, max(largest), step, any(piled))
+    frames = [_look(path) for path in paths]
+    step = int(np.gcd.reduce([frame.step for frame in frames]))
+    largest = max(frame.largest for frame in frames)
+    bit_count = _settled_bits(bits, largest, step, any(frame.piled for frame in frames))
     black_dn = (black_level or 0.0) / step
-    darkest_dn = min(darkest) / step
-    middle_dn = float(np.median(middles)) / step
+    darkest_dn = min(frame.darkest for frame in frames) / step
+    middle_dn = float(np.median([frame.middle for frame in frames])) / step
     if not 0 <= black_dn < max(middle_dn, 1.0):
         raise OptionError(
             "`black_level` must be at least 0 and below the median of the images, "
@@ -123,11 +125,26 @@ def open_frames(images: Sequence[Path], bits: int | None, black_level: float | N
     return Frames(paths, step, bit_count, bits is not None, black_dn, darkest_dn)
 
 
-def _look(path: Path) -> tuple[int, int, bool, float, float]:
-    """Return statistics of the stored values of one frame: the largest integer that divides all
-    values, the largest value, True if pixels accumulate there, as they do only at full scale, the
-    value of the darkest pixels, and the median.
+class _Values(NamedTuple):
+    """Statistics of the stored values of one frame.
+
+    Attributes:
+        step: the largest integer that divides all values.
+        largest: the largest value.
+        piled: True if pixels accumulate there, as they do only at full scale.
+        darkest: the value of the darkest pixels.
+        middle: the median.
     """
+
+    step: int
+    largest: int
+    piled: bool
+    darkest: float
+    middle: float
+
+
+def _look(path: Path) -> _Values:
+    """Return statistics of one frame; raise ImageError if its values are no digital numbers."""
     pixels = read_raw(path)
     values = pixels.astype(np.int64, copy=False).ravel()
     largest = int(values.max())
@@ -148,7 +165,7 @@ def _look(path: Path) -> tuple[int, int, bool, float, float]:
     # 0 also stands for a missing pixel, so it says nothing about the dark.
     present = values[values > 0]
     darkest, middle = np.percentile(present, [DARKEST_PERCENT, 50]) if present.size else (0.0, 0.0)
-    return step, largest, piled, float(darkest), float(middle)
+    return _Values(step, largest, piled, float(darkest), float(middle))
 
 
 def _settled_bits(stated: int | None, largest: int, step: int, piled: bool) -> int:
