@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -159,7 +159,7 @@ def run_sweep(
             # Edges do not depend on the brightness of the scenes: they are measured at 1 alone.
             edges = acquire_edges(sensor, seed) if brightness == 1 else []
             for supposed, other, method in trials[name]:
-                key = (name, supposed, method.name)
+                key = Key(name, supposed, method.name)
                 specialised = method.with_sensor(other)
                 psnr[key] = _psnr_db(specialised, pairs, sensor.max_dn)
                 if brightness == 1 and supposed in (name, NOMINAL):
@@ -183,16 +183,24 @@ def _psnr_db(method: Method, pairs: Sequence[NamedPair], max_dn: int) -> np.ndar
 NOMINAL_KNOWN = "traditional, nominal sensor known"
 TRUTH_KNOWN = "traditional, true sensor known"
 
-Key = tuple[str, str, str]
-"""The names of the true condition, of the sensor that the method assumes, and of the method."""
+
+class Key(NamedTuple):
+    """The names that identify a trial: one method on the images of one sensor.
+
+    Attributes:
+        truth: the true condition: the sensor that acquired the images.
+        supposed: the sensor that the method assumes.
+        method: the method.
+    """
+
+    truth: str
+    supposed: str
+    method: str
 
 
 @dataclass(frozen=True)
 class SweepResult:
     """The measurements of a sweep over N images.
-
-    A trial is one method on the images of one sensor. Its key has three names: of the condition
-    (the sensor that acquired the images), of the sensor that the method assumes, and of the method.
 
     Attributes:
         psnr: for each trial the PSNR in dB, (2, N): of each image against the reference, and
@@ -213,14 +221,14 @@ class SweepResult:
     @property
     def conditions(self) -> list[str]:
         """The names of the conditions, the sensors that acquired the images, in order."""
-        return list(dict.fromkeys(truth for truth, _, _ in self.psnr))
+        return list(dict.fromkeys(key.truth for key in self.psnr))
 
     @property
     def networks(self) -> list[str]:
         """The names of the methods that are neither the degraded input nor the traditional
         pipeline.
         """
-        names = dict.fromkeys(name for *_, name in self.psnr)
+        names = dict.fromkeys(key.method for key in self.psnr)
         return [name for name in names if name not in (DEGRADED, TRADITIONAL)]
 
     @property
@@ -241,10 +249,10 @@ class SweepResult:
         rows: list[Row] = []
         for (table, figures), truth in product(tables, self.conditions):
             columns = {
-                DEGRADED: (truth, truth, DEGRADED),
-                TRUTH_KNOWN: (truth, truth, TRADITIONAL),
-                NOMINAL_KNOWN: (truth, NOMINAL, TRADITIONAL),
-                **{name: (truth, truth, name) for name in self.networks},
+                DEGRADED: Key(truth, truth, DEGRADED),
+                TRUTH_KNOWN: Key(truth, truth, TRADITIONAL),
+                NOMINAL_KNOWN: Key(truth, NOMINAL, TRADITIONAL),
+                **{name: Key(truth, truth, name) for name in self.networks},
             }
             row = {column: figures[key] for column, key in columns.items()}
             rows.append(Row(table, truth, row))
@@ -258,7 +266,7 @@ class SweepResult:
         table = "sweep, gain over the pipeline"
         gains = {
             truth: {
-                name: self.psnr[truth, truth, name][0] - self.psnr[truth, truth, TRADITIONAL][0]
+                name: self._known(truth, name) - self._known(truth, TRADITIONAL)
                 for name in self.networks
             }
             for truth in self.conditions
@@ -275,19 +283,22 @@ class SweepResult:
 
     def _wrong(self) -> list[Row]:
         """Return the PSNR of each method that assumes a wrong sensor, and the loss due to that."""
-        pairs = dict.fromkeys(key[:2] for key in self.psnr if key[1] not in (key[0], NOMINAL))
+        wrong: dict[tuple[str, str], dict[str, np.ndarray]] = {}
+        for key, (in_db, _) in self.psnr.items():
+            if key.supposed not in (key.truth, NOMINAL):
+                wrong.setdefault((key.truth, key.supposed), {})[key.method] = in_db
         psnr = []
         losses = []
-        for pair in pairs:
-            truth, supposed = pair
-            wrong = {key[2]: values[0] for key, values in self.psnr.items() if key[:2] == pair}
-            cost = {
-                name: self.psnr[truth, truth, name][0] - values for name, values in wrong.items()
-            }
+        for (truth, supposed), by_method in wrong.items():
+            cost = {name: self._known(truth, name) - in_db for name, in_db in by_method.items()}
             row_name = f"{truth}, supposed {supposed}"
-            psnr.append(Row("sweep, sensor known wrongly", row_name, self._means(wrong)))
+            psnr.append(Row("sweep, sensor known wrongly", row_name, self._means(by_method)))
             losses.append(Row("sweep, lost by a sensor known wrongly", row_name, self._means(cost)))
         return [*psnr, *losses]
+
+    def _known(self, truth: str, method: str) -> np.ndarray:
+        """Return the PSNR (N,) of a method that assumes the true sensor."""
+        return np.asarray(self.psnr[Key(truth, truth, method)][0])
 
     def _means(self, values: Mapping[str, np.ndarray]) -> dict[str, Figure]:
         return {name: self._mean(in_db) for name, in_db in values.items()}

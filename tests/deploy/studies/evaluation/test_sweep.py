@@ -135,10 +135,10 @@ def synthetic_sweep() -> SweepResult:
     for truth, ahead in lead.items():
         levels = {"degraded": site - 8, "traditional": site, "net": site + ahead}
         psnr |= {
-            (truth, truth, name): np.stack([level, level + 1]) for name, level in levels.items()
+            Key(truth, truth, name): np.stack([level, level + 1]) for name, level in levels.items()
         }
-    psnr["MTF 3%", "nominal", "traditional"] = np.stack([site - 2, site - 2])
-    psnr["MTF 3%", "MTF 7%", "net"] = np.stack([site - 1, site - 1])
+    psnr[Key("MTF 3%", "nominal", "traditional")] = np.stack([site - 2, site - 2])
+    psnr[Key("MTF 3%", "MTF 7%", "net")] = np.stack([site - 1, site - 1])
     return SweepResult(psnr, dict.fromkeys(psnr, unavailable("%", "no edges here")), SITES, 0)
 
 
