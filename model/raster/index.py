@@ -125,26 +125,32 @@ def index_files(path: Path, trusted: bool = False) -> tuple[Path, ...]:
 def _named(index: Path, home: Path, trusted: bool) -> Iterator[Path]:
     """Yield the files that one index names; `home` is the folder of the first index."""
     root = _parsed(index)
-    paths = _of_vrt(index, root) if root.tag == VRT else _of_dimap(index, root)
-    for text, folder, pixels in paths:
+    references = _of_vrt(index, root) if root.tag == VRT else _of_dimap(index, root)
+    for text, folder, has_pixels in references:
         if trusted and _is_elsewhere(text):
             continue
         file = _located(index, text, folder, None if trusted else home)
-        if pixels and not file.is_file():
+        if not has_pixels:
+            if is_index(file) and file.is_file():
+                yield file
+            continue
+        if not file.is_file():
             raise ImageError(
                 f"{index} names the tile '{printable(text)}', but there is no such file. Fetch it, "
                 "or write the index again."
             )
-        if pixels and file.suffix.lower() != ".vrt":
-            with file.open("rb") as stream:
-                is_image = stream.read(16).startswith(MAGIC)
-            if not is_image:
-                raise ImageError(
-                    f"{index} names the tile '{printable(text)}', which is not a TIFF, JPEG 2000, "
-                    "NITF, PNG or JPEG. Convert it to TIFF."
-                )
-        if pixels or (is_index(file) and file.is_file()):
-            yield file
+        if file.suffix.lower() != ".vrt" and not first_bytes(file, 16).startswith(MAGIC):
+            raise ImageError(
+                f"{index} names the tile '{printable(text)}', which is not a TIFF, JPEG 2000, "
+                "NITF, PNG or JPEG. Convert it to TIFF."
+            )
+        yield file
+
+
+def first_bytes(path: Path, count: int) -> bytes:
+    """Return the first `count` bytes of a file, or all of a shorter one."""
+    with path.open("rb") as stream:
+        return stream.read(count)
 
 
 def _parsed(path: Path) -> ET.Element:
@@ -157,11 +163,11 @@ def _parsed(path: Path) -> ET.Element:
     return root
 
 
-Named = Iterator[tuple[str, Path, bool]]
-"""A path as written in an index, the folder that it is relative to, and whether it holds pixels."""
+References = Iterator[tuple[str, Path, bool]]
+"""Paths as written in an index, the folder that each is relative to, and whether it has pixels."""
 
 
-def _of_vrt(path: Path, root: ET.Element) -> Named:
+def _of_vrt(path: Path, root: ET.Element) -> References:
     """Yield the paths in elements and attributes of a VRT, which are equivalent to GDAL."""
     for element in root.iter():
         for key, text in ((element.tag, element.text or ""), *element.attrib.items()):
@@ -171,7 +177,7 @@ def _of_vrt(path: Path, root: ET.Element) -> Named:
                 yield text.strip(), path.parent if relative == "1" else Path.cwd(), True
 
 
-def _of_dimap(path: Path, root: ET.Element) -> Named:
+def _of_dimap(path: Path, root: ET.Element) -> References:
     """Yield the paths of a DIMAP in attributes, or in elements that replace them.
 
     Both are equivalent to GDAL.

@@ -23,7 +23,7 @@ from rasterio.windows import Window
 
 from beers_deploy.model.raster.description import mask_file, raster_of
 from beers_deploy.model.raster.facts import Raster
-from beers_deploy.model.raster.index import MAGIC, index_files, is_index, read_xml
+from beers_deploy.model.raster.index import MAGIC, first_bytes, index_files, is_index, read_xml
 from beers_deploy.model.raster.source import Source
 from beers_deploy.profiles.errors import (
     CODE_FAULTS,
@@ -165,8 +165,7 @@ def _driver(path: Path) -> str:
         )
     if suffix == ".img" and path.with_suffix(".hdr").is_file():
         # The header may belong to another file of that stem.
-        with path.open("rb") as stream:
-            return DRIVERS[suffix] if stream.read(len(HFA)) == HFA else "ENVI"
+        return DRIVERS[suffix] if first_bytes(path, len(HFA)) == HFA else "ENVI"
     return DRIVERS[suffix]
 
 
@@ -176,8 +175,7 @@ def _require_sidecars(path: Path) -> None:
     mask = mask_file(path)
     if mask.is_file():
         # GDAL opens a mask with any of its drivers, also with those that follow names.
-        with mask.open("rb") as stream:
-            is_tiff = stream.read(4) in MAGIC[:4]
+        is_tiff = first_bytes(mask, 4) in MAGIC[:4]
         if not is_tiff:
             raise ImageError(f"{mask} is not a mask stored as TIFF. {advice}")
     metadata = path.with_name(f"{path.name}.aux.xml")
