@@ -114,7 +114,23 @@ def _restore(
     count, height_px, width_px = bands.shape
     nodata = usable_nodata(value, dtype)
     raster = Raster(count, height_px, width_px, dtype, nodata, mask_kind=mask_kind)
-    if not hasattr(image, "__dask_graph__"):
+    if hasattr(image, "__dask_graph__"):
+        if np.ma.isMaskedArray(getattr(image, "_meta", None)):
+            raise ImageError(
+                "`image` is a masked Dask array, which is not supported. Fill it with "
+                "dask.array.ma.filled(image, 0) and give that value as `nodata`, or compute it "
+                "first."
+            )
+        if level is not None:
+            raise OptionError("`interval` needs pixels in memory. Compute the Dask array first.")
+        pipeline = load()
+        if not isinstance(pipeline, NetworkPipeline):
+            raise OptionError(
+                "`method` must be 'network' for a Dask array. Compute the array first, or use a "
+                "network."
+            )
+        results = [restore_lazily(bands, raster, pipeline, reading)]
+    else:
         work = load().prepare(ArraySource(bands, raster), reading, NAME)
         widths = () if level is None else half_widths_of(work, level)
         with steps("restoring", work.ticks(0)) as bar:
@@ -125,21 +141,6 @@ def _restore(
         if widths:
             half = HalfWidths(work.source, lambda band, top, stop: pixels[band, top:stop], widths)
             results.append(np.stack([half.read(band, 0, height_px) for band in range(count)]))
-    elif np.ma.isMaskedArray(getattr(image, "_meta", None)):
-        raise ImageError(
-            "`image` is a masked Dask array, which is not supported. Fill it with "
-            "dask.array.ma.filled(image, 0) and give that value as `nodata`, or compute it first."
-        )
-    else:
-        if level is not None:
-            raise OptionError("`interval` needs pixels in memory. Compute the Dask array first.")
-        pipeline = load()
-        if not isinstance(pipeline, NetworkPipeline):
-            raise OptionError(
-                "`method` must be 'network' for a Dask array. Compute the array first, or use a "
-                "network."
-            )
-        results = [restore_lazily(bands, raster, pipeline, reading)]
     return [each[0] if image.ndim == 2 and len(each) == 1 else each for each in results]
 
 
