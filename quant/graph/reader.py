@@ -244,29 +244,24 @@ class _Reader:
             raise _refused(self.source, node)
 
     def _arithmetic(self, node: Node) -> None:
-        """Append a sum, difference or product of two tensors, or of one with constants."""
+        """Append a sum or product of two tensors; or, for arithmetic with one number a channel, a
+        depthwise convolution of one pixel.
+        """
         constants = self.source.constants
         shapes = [constants[name].shape for name in node.inputs if name in constants]
-        if shapes:
-            self.ops.append(self._by_constant(node, shapes[0]))
+        if not shapes:
+            rule = "must divide by a constant, not by a computed tensor"
+            require(node.op_type != "Div", node, rule)
+            # Simplification has made an Add of a Sub whose channels are known.
+            require(node.op_type != "Sub", node, "subtracts a map of unknown channels")
+            kind = Mul if node.op_type == "Mul" else Add
+            self.ops.append(kind(node.name, node.inputs, node.result))
             return
-        require(node.op_type != "Div", node, "must divide by a constant, not by a computed tensor")
-        # Simplification has made an Add of a Sub whose channels are known.
-        require(node.op_type != "Sub", node, "subtracts a map of unknown channels")
-        kind = Mul if node.op_type == "Mul" else Add
-        self.ops.append(kind(node.name, node.inputs, node.result))
-
-    def _by_constant(self, node: Node, shape: tuple[int, ...]) -> Op:
-        """Read arithmetic with one number a channel as a depthwise convolution of one pixel.
-
-        Args:
-            node: the arithmetic.
-            shape: the shape of its constant.
-        """
         match = affine_of(self.source, node)
         if match is None:
+            size = times(shapes[0])
             raise unsupported(
-                f"{node} must have a constant of one number for each channel, got {times(shape)}."
+                f"{node} must have a constant of one number for each channel, got {size}."
             )
         source, affine = match
         channels = channels_of(self.ops, {self.image: self.channels()})[source]
@@ -280,7 +275,7 @@ class _Reader:
             for values in (affine.scale, affine.shift)
         )
         weight = scale[:, None, None, None]
-        return Conv(node.name, source, node.result, weight, shift, groups=channels)
+        self.ops.append(Conv(node.name, source, node.result, weight, shift, groups=channels))
 
     def _activation(self, node: Node) -> None:
         """Fuse an activation into the operation before it, or append it as a separate operation."""

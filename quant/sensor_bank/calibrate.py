@@ -74,7 +74,7 @@ def _analytic(scale: int, result: int, shifts: Shifts, decoding: BankSum, inputs
     Args:
         scale: the scale of the network.
         result: the fractional bits of the correction, which the results are stated to have as well.
-        shifts: the windows of the target.
+        shifts: the smallest and largest shifts that the target allows.
         decoding: the decoding of the results.
         inputs: the number of the bank's channels of each pixel, the analytic restoration last.
     """
