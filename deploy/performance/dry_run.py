@@ -127,22 +127,22 @@ def place_words(raster: Raster) -> Mapping[str, str]:
     Returns:
         The texts "georeference" and "rational polynomials" of a row, each "none" if absent.
     """
-    place = raster.place
+    georeference = raster.georeference
     words = "none"
-    if place.crs or place.transform or place.gcps:
+    if georeference.crs or georeference.transform or georeference.gcps:
         words = "no coordinate system"
-        if place.crs:
-            code = place.crs.to_epsg()
+        if georeference.crs:
+            code = georeference.crs.to_epsg()
             words = f"EPSG:{code}" if code else "a coordinate system without a code"
-    if place.transform:
-        corner = place.transform
+    if georeference.transform:
+        corner = georeference.transform
         words += (
             f", first corner ({corner.c:.9g}, {corner.f:.9g}), pixels of {abs(corner.a):.9g} x "
             f"{abs(corner.e):.9g}"
         )
-    if place.gcps:
-        words += f", {len(place.gcps)} ground control points"
-    return {"georeference": words, "rational polynomials": "yes" if place.rpcs else "none"}
+    if georeference.gcps:
+        words += f", {len(georeference.gcps)} ground control points"
+    return {"georeference": words, "rational polynomials": "yes" if georeference.rpcs else "none"}
 
 
 def time_here(network: Network, plan: Plan, engine: Engine) -> Figure:

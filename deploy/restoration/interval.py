@@ -156,7 +156,7 @@ def write_half_widths(
         *raster.shape,
         np.dtype(np.float32),
         nodata=float("nan"),
-        place=raster.place,
+        georeference=raster.georeference,
         band_info=named,
     )
     with whole_file(path) as temporary:

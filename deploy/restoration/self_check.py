@@ -243,7 +243,7 @@ def write_map(path: Path, blocks: BlockMap, raster: Raster) -> None:
         nodata=float("nan"),
         mask_kind="",
         colour=False,
-        place=raster.place.enlarged(1 / BLOCK_PX),
+        georeference=raster.georeference.enlarged(1 / BLOCK_PX),
         band_info=tuple(infos),
         tags=(),
     )

@@ -89,12 +89,9 @@ def require_allowed(parameter: Parameter, value: object) -> None:
     # The text "no" would count as True.
     if bool in parts and isinstance(value, str):
         raise OptionError(f"`{name}` must be True or False, got {printable(repr(value))}.")
-    number = _number(name, value) if {int, float}.intersection(parts) else None
-    if number is not None and float not in parts and not isinstance(value, Integral):
-        raise OptionError(f"`{name}` must be an integer, got {printable(repr(value))}.")
+    if {int, float}.intersection(parts):
+        _require_number(name, value, parts)
     for part in parts:
-        if isinstance(part, Interval) and number is not None:
-            _require_inside(name, number, part)
         # An array compares element by element.
         choices = get_args(part) if get_origin(part) is Literal else None
         if choices and not (isinstance(value, str | Real) and value in choices):
@@ -122,25 +119,28 @@ def _require_text(name: str, value: object, parts: list[Any]) -> None:
     raise OptionError(f"`{name}` must be {expected}, got {printable(repr(value))}.")
 
 
-def _number(name: str, value: object) -> float:
-    """Return a number of Python or NumPy as a float, or raise OptionError."""
+def _require_number(name: str, value: object, parts: list[Any]) -> None:
+    """Raise OptionError unless a value is a number of Python or NumPy, an integer if no float is
+    allowed, and inside the parameter's interval.
+    """
     # float() would read text, and would count True as 1.
     given = None if isinstance(value, bool) or not isinstance(value, Real) else value
     try:
-        return float(cast(float, given))
+        number = float(cast(float, given))
     except (TypeError, OverflowError) as error:
         raise OptionError(f"`{name}` must be one number, got {printable(repr(value))}.") from error
-
-
-def _require_inside(name: str, value: float, interval: Interval) -> None:
-    low = -math.inf if interval.ge is None else float(str(interval.ge))
-    high = math.inf if interval.le is None else float(str(interval.le))
-    # NaN lies in no interval. An infinite number would be no valid JSON in the results.
-    if low <= value <= high and not math.isinf(value):
-        return
-    if math.isinf(high):
-        raise OptionError(f"`{name}` must be a finite number of at least {low:g}, got {value:g}.")
-    raise OptionError(f"`{name}` must be from {low:g} to {high:g}, got {value:g}.")
+    if float not in parts and not isinstance(value, Integral):
+        raise OptionError(f"`{name}` must be an integer, got {printable(repr(value))}.")
+    for interval in (part for part in parts if isinstance(part, Interval)):
+        low = -math.inf if interval.ge is None else float(str(interval.ge))
+        high = math.inf if interval.le is None else float(str(interval.le))
+        # NaN lies in no interval. An infinite number would be no valid JSON in the results.
+        if low <= number <= high and not math.isinf(number):
+            continue
+        allowed = f"from {low:g} to {high:g}"
+        if math.isinf(high):
+            allowed = f"a finite number of at least {low:g}"
+        raise OptionError(f"`{name}` must be {allowed}, got {number:g}.")
 
 
 @dataclass(frozen=True)

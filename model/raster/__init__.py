@@ -1,6 +1,6 @@
 """The only reader and writer of images, on GDAL through rasterio.
 
-facts        properties of an image before its pixels are read: `Raster`, `Place`
+facts        properties of an image before its pixels are read: `Raster`, `Georeference`
 source       an image as a source of rows: `Source`, `ArraySource`
 index        indexes of tiles (VRT, DIMAP), checked before GDAL follows them
 description  the properties that GDAL states of an open image

@@ -10,8 +10,8 @@ import numpy as np
 from beers_deploy.model.raster.facts import (
     RGB_BANDS,
     BandInfo,
+    Georeference,
     MaskKind,
-    Place,
     Raster,
     is_restored,
     require_numbers,
@@ -86,7 +86,7 @@ def raster_of(path: Path, dataset: Any) -> Raster:
         colour=colours[:bands] == list(RGB_BANDS),
         restored=is_restored(tags.get("TIFFTAG_SOFTWARE", ""), tags),
         # A transform, or ground control points.
-        place=Place(
+        georeference=Georeference(
             crs=points_crs if points else dataset.crs,
             transform=None if points or dataset.transform.is_identity else dataset.transform,
             gcps=tuple((at.row, at.col, at.x, at.y, at.z or 0.0) for at in points),

@@ -1,4 +1,4 @@
-"""Describe an image before its pixels are read: size, type, missing pixels, and place."""
+"""Describe an image before its pixels are read: size, type, missing pixels, georeference."""
 
 import math
 from collections.abc import Sequence
@@ -57,7 +57,7 @@ def extent_of(pixels: np.ndarray, valid: np.ndarray | bool = True) -> Extent:
 
 
 @dataclass(frozen=True)
-class Place:
+class Georeference:
     """The position of an image on Earth, in GDAL's terms.
 
     Attributes:
@@ -76,9 +76,9 @@ class Place:
     rpcs: tuple[tuple[str, str], ...] = ()
     area_or_point: str = ""
 
-    def enlarged(self, scale: float) -> "Place":
-        """Return the place of the same image with `scale` times the pixels along either side; fewer
-        of them if `scale` is below 1.
+    def enlarged(self, scale: float) -> "Georeference":
+        """Return the georeference of the same image with `scale` times the pixels along either
+        side; fewer of them if `scale` is below 1.
 
         A pixel's corner at (column, row) moves to `scale` times both. Rational polynomials count
         from the middle of the first pixel, so their offsets also move by half a pixel (NITF
@@ -147,7 +147,7 @@ class Raster:
         mask_kind: what marks missing pixels in addition to NaN and `nodata`; empty if nothing does.
         colour: True if the bands are red, green and blue.
         restored: True if this project's `restore` has written the image.
-        place: where the image lies on Earth.
+        georeference: where the image lies on Earth.
         band_info: names, units and scales; empty, or one for each band.
         tags: the file's metadata items that a restored image keeps, as pairs of name and text.
     """
@@ -161,7 +161,7 @@ class Raster:
     mask_kind: MaskKind = ""
     colour: bool = False
     restored: bool = False
-    place: Place = Place()
+    georeference: Georeference = Georeference()
     band_info: tuple[BandInfo, ...] = ()
     tags: tuple[tuple[str, str], ...] = ()
 
@@ -238,7 +238,7 @@ class Raster:
             dtype=self.out_dtype,
             nodata=nodata,
             colour=self.colour and alike,
-            place=self.place.enlarged(width_px // self.width_px),
+            georeference=self.georeference.enlarged(width_px // self.width_px),
             band_info=self.band_info if alike else (),
         )
 

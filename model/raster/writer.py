@@ -90,10 +90,10 @@ def write_raster(
     with disk_errors(path), gdal(GDAL_CACHEMAX=LEAST_CACHE_BYTES, GDAL_TIFF_INTERNAL_MASK="YES"):
         with rasterio.open(path, "w", **_profile(raster, compression)) as file:
             file.update_tags(TIFFTAG_SOFTWARE=software, **dict(raster.tags))
-            if raster.place.area_or_point:
-                file.update_tags(AREA_OR_POINT=raster.place.area_or_point)
-            if raster.place.rpcs:
-                file.update_tags(ns="RPC", **dict(raster.place.rpcs))
+            if raster.georeference.area_or_point:
+                file.update_tags(AREA_OR_POINT=raster.georeference.area_or_point)
+            if raster.georeference.rpcs:
+                file.update_tags(ns="RPC", **dict(raster.georeference.rpcs))
             if raster.mask_kind == "alpha":
                 # The creation option ALPHA would mark the first band after grey or blue.
                 grey = [ColorInterp.gray, *[ColorInterp.undefined] * raster.bands]
@@ -175,8 +175,8 @@ def disk_errors(output: Path | str | None = None) -> Iterator[None]:
 
 def _profile(raster: Raster, compression: Compression) -> dict[str, Any]:
     """Return the creation options of a TIFF."""
-    place = raster.place
-    points = [GroundControlPoint(row, column, *at) for row, column, *at in place.gcps]
+    georeference = raster.georeference
+    points = [GroundControlPoint(row, column, *at) for row, column, *at in georeference.gcps]
     profile: dict[str, Any] = {
         "driver": "GTiff",
         "width": raster.width_px,
@@ -184,7 +184,7 @@ def _profile(raster: Raster, compression: Compression) -> dict[str, Any]:
         "count": raster.bands + (raster.mask_kind == "alpha"),
         "dtype": raster.dtype.name,
         "nodata": raster.nodata,
-        "crs": place.crs,
+        "crs": georeference.crs,
         "tiled": True,
         "blockxsize": TILE_PX,
         "blockysize": TILE_PX,
@@ -200,8 +200,8 @@ def _profile(raster: Raster, compression: Compression) -> dict[str, Any]:
         profile["predictor"] = 2
     if points:
         profile["gcps"] = points
-    elif place.transform is not None:
-        profile["transform"] = place.transform
+    elif georeference.transform is not None:
+        profile["transform"] = georeference.transform
     return profile
 
 

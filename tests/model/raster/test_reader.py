@@ -134,7 +134,7 @@ def test_items_that_rasterio_cannot_write_are_not_kept(tmp_path: Path) -> None:
     (tmp_path / "a.tif.aux.xml").write_text(f"<PAMDataset>{domains}</PAMDataset>")
     with open_raster(tmp_path / "a.tif") as source:
         raster = source.raster
-    assert raster.tags == raster.place.rpcs == (("OWN", "1"),)
+    assert raster.tags == raster.georeference.rpcs == (("OWN", "1"),)
     write_array(tmp_path / "b.tif", raster, pixels_of("uint16")[None])
     with open_raster(tmp_path / "b.tif") as source:
         assert source.raster.tags == raster.tags
@@ -152,14 +152,14 @@ def test_sidecars_place_an_image(tmp_path: Path) -> None:
     )
     for name, sidecar in (("world", "world.tfw"), ("gdal", "gdal.tif.aux.xml")):
         with open_raster(tmp_path / f"{name}.tif") as source:
-            assert source.raster.place.transform[:6] == (0.5, 0, 300000, 0, -0.5, 4800000)
+            assert source.raster.georeference.transform[:6] == (0.5, 0, 300000, 0, -0.5, 4800000)
             assert tmp_path / sidecar in source.files
     tifffile.imwrite(tmp_path / "IMG_a_R1C1.TIF", pixels)
     formats.write_dimap(tmp_path / "DIM.XML")
     (tmp_path / "RPC.XML").rename(tmp_path / "RPC_a.XML")
     (tmp_path / "DIM.XML").rename(tmp_path / "DIM_a.XML")
     with open_raster(tmp_path / "IMG_a_R1C1.TIF") as source:
-        assert dict(source.raster.place.rpcs)["LINE_OFF"].startswith("9.33")
+        assert dict(source.raster.georeference.rpcs)["LINE_OFF"].startswith("9.33")
 
 
 @pytest.mark.parametrize("name", ["a.img", "b.bsq"])
