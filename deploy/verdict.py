@@ -27,7 +27,7 @@ from beers_deploy.comparison import Comparison
 from beers_deploy.dpu.board import device_of
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.checker.table import legality
-from beers_deploy.dpu.reading import network_of, usual_tile_px
+from beers_deploy.dpu.reading import sized_graph, usual_tile_px
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import OptionError, encodable, printable, reason_of
 from beers_deploy.profiles.figures import Check
@@ -360,7 +360,7 @@ def file_checks(
         return checks
     with faults_named(int8.label):
         core = as_on_board(int8.model)
-        graph = network_of(core, usual_tile_px(core), int8.name)
+        graph = sized_graph(core, usual_tile_px(core), int8.name)
     dpu = device_of(target)
     return [legality(place(graph, dpu), dpu), *checks]
 

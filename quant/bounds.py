@@ -29,7 +29,7 @@ from beers_deploy.quant.integer.arithmetic import (
 from beers_deploy.quant.integer.reference import layer_sums, rounded
 
 
-class Range(NamedTuple):
+class ChannelRange(NamedTuple):
     """The smallest and the largest integer of each channel, (C,) each."""
 
     low: np.ndarray
@@ -74,13 +74,15 @@ def layer_bounds(core: IntCore) -> list[LayerBound]:
         One `LayerBound` per operation, in the order of the operations.
     """
     channels = core.host_part.channels
-    ranges = {PLANES: Range(*(np.repeat(end, channels) for end in core.host_part.encoding.limits))}
+    ranges = {
+        PLANES: ChannelRange(*(np.repeat(end, channels) for end in core.host_part.encoding.limits))
+    }
     bounds = []
     for op in core.ops:
         (low, high), shift = _accumulated(core, op, ranges)
         bits = float(np.log2(max(int(np.abs(low).max()), int(np.abs(high).max()), 1)))
         low, high = (rounded(end, shift, half_even=False)[0] for end in (low, high))
-        ranges[op.output] = Range(saturated(low), saturated(high))
+        ranges[op.output] = ChannelRange(saturated(low), saturated(high))
         bounds.append(LayerBound(op.name, bits, int(low.min()), int(high.max())))
     return bounds
 
@@ -98,7 +100,9 @@ def within_int8(core: IntCore) -> set[str]:
     }
 
 
-def _accumulated(core: IntCore, op: IntConv | Op, ranges: Mapping[str, Range]) -> tuple[Range, int]:
+def _accumulated(
+    core: IntCore, op: IntConv | Op, ranges: Mapping[str, ChannelRange]
+) -> tuple[ChannelRange, int]:
     """Return the range of an operation's accumulators, including zero padding, and the shift to
     int8.
     """
@@ -109,44 +113,46 @@ def _accumulated(core: IntCore, op: IntConv | Op, ranges: Mapping[str, Range]) -
         # A sum rises with each term, so its extremes are the sums of the ends.
         low = layer_sums(core, op, {name: ranges[name].low for name in op.inputs})
         high = layer_sums(core, op, {name: ranges[name].high for name in op.inputs})
-        return Range(low.values, high.values), low.shift
+        return ChannelRange(low.values, high.values), low.shift
     if isinstance(op, Mul):
         # A product is linear in each factor, so its extremes lie at the ends of both intervals.
         corners = np.array([a.astype(np.int64) * b for a, b in product(inputs[0], inputs[1])])
         shift = op_shifts(op, core.frac_bits)["shift_cut"]
-        return Range(corners.min(0), corners.max(0)), shift
+        return ChannelRange(corners.min(0), corners.max(0)), shift
     if isinstance(op, AveragePool):
         assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
         factor, shift = mean_factor(op.kernel)
         area = op.kernel[0] * op.kernel[1]
-        return Range(*(area * factor * end.astype(np.int64) for end in _padded(inputs[0]))), shift
+        return ChannelRange(
+            *(area * factor * end.astype(np.int64) for end in _padded(inputs[0]))
+        ), shift
     if isinstance(op, Resize) and op.bilinear:
         # The weights of each pixel add up to 2^shift.
         _, shift = bilinear_weights(op.factor)
-        return Range(*(end.astype(np.int64) << shift for end in inputs[0])), shift
+        return ChannelRange(*(end.astype(np.int64) << shift for end in inputs[0])), shift
     return _moved(core, op, inputs), 0
 
 
-def _moved(core: IntCore, op: Op, inputs: list[Range]) -> Range:
+def _moved(core: IntCore, op: Op, inputs: list[ChannelRange]) -> ChannelRange:
     """Compute the range of an operation that only moves values or looks them up."""
     low, high = map(np.concatenate, zip(*inputs, strict=True))
     if isinstance(op, Pointwise):
         table = activation_table(op, core.frac_bits)
         spans = [table[a - INT8_MIN : b - INT8_MIN + 1] for a, b in zip(low, high, strict=True)]
-        return Range(*(np.array([end(span) for span in spans]) for end in (np.min, np.max)))
+        return ChannelRange(*(np.array([end(span) for span in spans]) for end in (np.min, np.max)))
     if isinstance(op, Shuffle):
         side = 1 if op.up else op.block
         maps = [op(np.tile(end[None, :, None, None], (1, 1, side, side)))[0] for end in (low, high)]
-        return Range(maps[0].min((1, 2)), maps[1].max((1, 2)))
-    return Range(low, high)
+        return ChannelRange(maps[0].min((1, 2)), maps[1].max((1, 2)))
+    return ChannelRange(low, high)
 
 
-def _padded(source: Range) -> Range:
+def _padded(source: ChannelRange) -> ChannelRange:
     """Return the range with the zeros that padding adds."""
-    return Range(np.minimum(source.low, 0), np.maximum(source.high, 0))
+    return ChannelRange(np.minimum(source.low, 0), np.maximum(source.high, 0))
 
 
-def _conv(core: IntCore, op: IntConv, source: Range) -> tuple[Range, int]:
+def _conv(core: IntCore, op: IntConv, source: ChannelRange) -> tuple[ChannelRange, int]:
     low, high = _padded(source)
     weight = op.weight.astype(np.int64)
     accumulator_bits = op.accumulator_bits(core.frac_bits)
@@ -163,4 +169,4 @@ def _conv(core: IntCore, op: IntConv, source: Range) -> tuple[Range, int]:
     (least, finer), (most, _) = (
         activated(end, op.activation, accumulator_bits) for end in (least, most)
     )
-    return Range(least, most), accumulator_bits - core.frac_bits[op.output] + finer
+    return ChannelRange(least, most), accumulator_bits - core.frac_bits[op.output] + finer

@@ -141,7 +141,7 @@ def singles_of(graph: Graph, host_part: HostPart, groups: list[ResidualGroup]) -
     return SingleTensors(names, tuple(widths[name] for name in names), depthwise or not groups)
 
 
-def rounded(plan: Plan, images: Sequence[np.ndarray]) -> tuple[IntCore, Graph]:
+def carry_out(plan: Plan, images: Sequence[np.ndarray]) -> tuple[IntCore, Graph]:
     """Carry out a plan on calibration images: choose scales, equalise, and round to integers.
 
     These are steps 3 to 7 of the module.

@@ -32,7 +32,7 @@ from beers_deploy.quant.passes.effort import Effort
 from beers_deploy.quant.passes.long_skip import activates_sums, split_long_skip
 from beers_deploy.quant.passes.residual_groups import residual_groups
 from beers_deploy.quant.passes.selection import ALL, Passes
-from beers_deploy.quant.plan import Plan, rounded, singles_of
+from beers_deploy.quant.plan import Plan, carry_out, singles_of
 from beers_deploy.quant.samples.coverage import KEY, histogram, range_from
 from beers_deploy.quant.samples.patches import Patches
 
@@ -116,7 +116,7 @@ def quantize_model(
     brightens = brightens and (network.adds_image or tuning is None)
     plan = Plan(graph, host_part, groups, singles, shifts, passes, effort, brightens)
     # 3. to 7. are in `quant.plan`.
-    core, final = rounded(plan, patches.degraded)
+    core, final = carry_out(plan, patches.degraded)
     shares = (to_shares(image, patches.ranges) for image in patches.degraded)
     # The interval of the float network does not hold for the integers, whose errors are others.
     own = {key: value for key, value in metadata(model).items() if key != INTERVAL}

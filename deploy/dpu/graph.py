@@ -16,7 +16,7 @@ from beers_deploy.quant.graph.quantized import Scale
 from beers_deploy.quant.onnx.graph import Node
 from beers_deploy.quant.onnx.messages import sizes_of
 from beers_deploy.quant.onnx.runnable import LIST_VALUES
-from beers_deploy.quant.onnx.window import Pair, Window
+from beers_deploy.quant.onnx.window import Sides, Window
 
 Kind = Literal[
     "conv",
@@ -189,7 +189,7 @@ class Operation:
     outputs: tuple[str, ...]
     in_shapes: tuple[Shape | None, ...] = ()
     out_shape: Shape | None = None
-    kernel: Pair = (1, 1)
+    kernel: Sides = (1, 1)
     window: Window = field(default_factory=Window)
     channels: tuple[int, int] = (0, 0)
     weight_bytes: int = 0

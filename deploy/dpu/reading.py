@@ -24,7 +24,7 @@ from beers_deploy.quant.graph.pixel_shuffle import with_shuffles
 from beers_deploy.quant.graph.quantized import Integers
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.image_input import require_image
-from beers_deploy.quant.onnx.window import Pair, Window
+from beers_deploy.quant.onnx.window import Sides, Window
 from beers_deploy.quant.onnx_file import faults_named, load_onnx, metadata
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from beers_deploy.quant.untrusted import contradictions
@@ -44,7 +44,7 @@ damaged.
 """
 
 
-def read_network(path: Path, tile_px: int | None = 640) -> SizedGraph:
+def read_sized_graph(path: Path, tile_px: int | None = 640) -> SizedGraph:
     """Read an ONNX file as the list of operations that a DPU would compute.
 
     Args:
@@ -56,7 +56,7 @@ def read_network(path: Path, tile_px: int | None = 640) -> SizedGraph:
     Raises:
         ModelError: the file is not a valid ONNX network of images of this size.
     """
-    return network_of(load_onnx(path, to_run=False), tile_px, str(path))
+    return sized_graph(load_onnx(path, to_run=False), tile_px, str(path))
 
 
 def own_tile_px(model: onnx.ModelProto) -> int | None:
@@ -104,7 +104,7 @@ def _places(model: onnx.ModelProto) -> tuple[int, int]:
     return place_px, border_px
 
 
-def network_of(
+def sized_graph(
     model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model"
 ) -> SizedGraph:
     """Convert an ONNX model in memory to the list of operations that a DPU would compute.
@@ -244,7 +244,7 @@ def _is_activation(graph: OnnxGraph, node: Node, integers: Integers) -> bool:
 
 def _window(
     node: Node, weight: np.ndarray | None, shapes: Sequence[Shape | None]
-) -> tuple[Pair, Window]:
+) -> tuple[Sides, Window]:
     # The window of a global pool is its whole map.
     size = shapes[0][1:] if shapes and shapes[0] else (0, 0)
     if "Global" in node.op_type:

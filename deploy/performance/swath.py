@@ -14,7 +14,7 @@ from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.host import FloatWork, Task
 from beers_deploy.dpu.cost.latency import Prediction, dpu_power, predict
 from beers_deploy.dpu.cost.model import Interval, between
-from beers_deploy.dpu.reading import network_of
+from beers_deploy.dpu.reading import sized_graph
 from beers_deploy.model.consistency.step import DETAIL_PRODUCTS_PER_PX, PRODUCTS_PER_PX
 from beers_deploy.model.exposure import exposures_for
 from beers_deploy.model.raster.facts import SIDE_PX
@@ -162,7 +162,7 @@ def predict_network(
         ModelError: the DPU does not run the network as a whole, or the network has no convolution.
     """
     source = Network.load(network, to_run=False)
-    sized = network_of(source.model, tile_px, source.label)
+    sized = sized_graph(source.model, tile_px, source.label)
     return predict(place(sized, dpu), dpu, task, step_px, float_work(source))
 
 

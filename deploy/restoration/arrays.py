@@ -16,7 +16,7 @@ from beers_deploy.model.raster.facts import (
     MaskKind,
     Raster,
     is_restored,
-    require_numbers,
+    require_pixel_type,
     require_raw,
     usable_nodata,
 )
@@ -108,7 +108,7 @@ def _restore(
     image: Any, reading: Reading, load: Callable[[], Pipeline], level: Level | None
 ) -> list[Any]:
     bands = _bands_first(image)
-    dtype = require_numbers(NAME, bands.dtype)
+    dtype = require_pixel_type(NAME, bands.dtype)
     value = None if reading.nodata is None else float(reading.nodata)
     mask_kind: MaskKind = "mask" if np.ma.isMaskedArray(bands) else ""
     count, height_px, width_px = bands.shape

@@ -26,7 +26,7 @@ a border are not evaluated.
 """
 
 
-class Blocks(NamedTuple):
+class LineBlocks(NamedTuple):
     """Lines of detectors (columns or rows), each measured in several blocks along it.
 
     Every array is (blocks, lines), NaN where nothing could be measured.
@@ -44,12 +44,12 @@ class Blocks(NamedTuple):
     level: np.ndarray
     constant: np.ndarray
 
-    def of(self, lines: slice) -> "Blocks":
+    def of(self, lines: slice) -> "LineBlocks":
         """Return the measurements of a range of lines, with all their blocks."""
-        return Blocks(*(array[:, lines] for array in self))
+        return LineBlocks(*(array[:, lines] for array in self))
 
 
-def join_blocks(blocks: Sequence[Blocks], axis: int = 0) -> Blocks:
+def join_blocks(blocks: Sequence[LineBlocks], axis: int = 0) -> LineBlocks:
     """Concatenate measurements of blocks.
 
     Args:
@@ -60,10 +60,10 @@ def join_blocks(blocks: Sequence[Blocks], axis: int = 0) -> Blocks:
     Returns:
         The measurements (blocks, lines) of all of them.
     """
-    return Blocks(*(np.concatenate(arrays, axis) for arrays in zip(*blocks, strict=True)))
+    return LineBlocks(*(np.concatenate(arrays, axis) for arrays in zip(*blocks, strict=True)))
 
 
-def measure_lines(pixels: np.ndarray, valid: np.ndarray) -> Blocks:
+def measure_lines(pixels: np.ndarray, valid: np.ndarray) -> LineBlocks:
     """Measure how each column of one block of an image differs from its two neighbours.
 
     Args:
@@ -78,7 +78,7 @@ def measure_lines(pixels: np.ndarray, valid: np.ndarray) -> Blocks:
     constant = constant_columns(pixels)
     nothing = np.full((1, columns), np.nan)
     if columns < 2 * REACH + 1:
-        return Blocks(nothing, nothing, nothing, constant[None])
+        return LineBlocks(nothing, nothing, nothing, constant[None])
     second = pixels[:, 1:-1] - (pixels[:, :-2] + pixels[:, 2:]) / 2
     mask = valid[:, 1:-1] & valid[:, :-2] & valid[:, 2:]
     located, error = (
@@ -88,7 +88,9 @@ def measure_lines(pixels: np.ndarray, valid: np.ndarray) -> Blocks:
     with np.errstate(invalid="ignore", divide="ignore"):
         level = np.where(4 * count >= rows, pixels.sum(0, dtype=np.float64, where=valid) / count, 0)
         around = median_filter(level, LEVEL_LINES, mode="nearest")
-        return Blocks(located, error, np.where(around > 0, around, np.nan)[None], constant[None])
+        return LineBlocks(
+            located, error, np.where(around > 0, around, np.nan)[None], constant[None]
+        )
 
 
 def _location(values: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import uniform_filter1d
 
-from beers_deploy.model.metrics.detector_lines import REACH, Blocks
+from beers_deploy.model.metrics.detector_lines import REACH, LineBlocks
 from beers_deploy.model.metrics.statistics import robust_deviation
 
 PARITY_LINES = 63
@@ -109,7 +109,7 @@ class Stripes:
         return replace(self, off=off, dead=tuple(sorted({numbers[index] for index in self.dead})))
 
 
-def judge_lines(blocks: Blocks, least: float) -> Stripes:
+def judge_lines(blocks: LineBlocks, least: float) -> Stripes:
     """Decide which lines of detectors are faulty, and how much all lines differ.
 
     Args:

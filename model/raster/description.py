@@ -14,7 +14,7 @@ from beers_deploy.model.raster.facts import (
     MaskKind,
     Raster,
     is_restored,
-    require_numbers,
+    require_pixel_type,
     require_size,
     require_small_offset,
     usable_nodata,
@@ -67,7 +67,7 @@ def raster_of(path: Path, dataset: Any) -> Raster:
         if len(set(texts)) > 1:
             stated = printable(", ".join(texts))
             raise ImageError(f"{name} has bands of different {kind}: {stated}. Split the bands.")
-    dtype = require_numbers(name, np.dtype(dataset.dtypes[0]))
+    dtype = require_pixel_type(name, np.dtype(dataset.dtypes[0]))
     require_size(name, bands, dataset.height, dataset.width)
     _require_light(name, dataset)
     for offset, scale in zip(dataset.offsets[:bands], dataset.scales[:bands], strict=True):

@@ -254,7 +254,7 @@ def require_size(name: str, bands: int, height_px: int, width_px: int) -> None:
         )
 
 
-def require_numbers(name: str, dtype: np.dtype[Any]) -> np.dtype[Any]:
+def require_pixel_type(name: str, dtype: np.dtype[Any]) -> np.dtype[Any]:
     """Return the type of the pixels; raise ImageError if it is no integer or float type."""
     if dtype.kind not in "uif":
         raise ImageError(

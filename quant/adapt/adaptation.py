@@ -63,7 +63,7 @@ class Adapted:
 
 
 @dataclass(frozen=True)
-class Trial:
+class Candidate:
     """A network with replaced operators, compared with the original network on held-out samples.
 
     Convolutions may be fitted to make up for the replacement (compensation).
@@ -130,7 +130,7 @@ def adapt(model: onnx.ModelProto, samples: Patches, held_out: Patches) -> Adapte
     normalizations = [each for each in (Normalization.of(graph, node) for node in ends) if each]
     inverses = fit_inverses(model, normalizations, images)
     # 1. and 2.
-    trials = dict[Kind, Trial]()
+    trials = dict[Kind, Candidate]()
     for kind in [kind for kind in counts if kind in APPROXIMATIONS]:
         trials[kind] = _trial(model, {kind}, set(), images, held_out, inverses)
         if kind in EXACT and not trials[kind].is_enough:
@@ -161,14 +161,14 @@ def _trial(
     images: Sequence[np.ndarray],
     held_out: Patches,
     inverses: Mapping[str, InverseDeviation],
-) -> Trial:
+) -> Candidate:
     """Replace some kinds of operators by other functions and some exactly, and compensate."""
     network = replaced(model, approximated, exact, inverses)
     session = open_any_size(model)
     before = compare(session, open_any_size(network), held_out)
     # Maps around a mirrored image are no longer those of the original.
     if not approximated or Kind.padding in approximated:
-        return Trial(network, before, before)
+        return Candidate(network, before, before)
     nodes = nodes_by_kind(OnnxGraph(model))
     approximations = chain.from_iterable(nodes[kind] for kind in approximated)
     changed = [node.outputs[0] for node in approximations]
@@ -177,8 +177,8 @@ def _trial(
     # Compared with the original, not with the references: a change may gain by chance on few
     # samples.
     if after.psnr_between_db < before.psnr_between_db:
-        return Trial(network, before, before)
-    return Trial(fitted, before, after)
+        return Candidate(network, before, before)
+    return Candidate(fitted, before, after)
 
 
 def _fit_images(model: onnx.ModelProto, images: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -22,7 +22,7 @@ from onnx import TensorProto
 from beers_deploy.model.progress import step
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.messages import replace_all
-from beers_deploy.quant.onnx.window import Pair, Window
+from beers_deploy.quant.onnx.window import Sides, Window
 from beers_deploy.quant.session import open_any_size, tensors_of, with_outputs
 from beers_deploy.quant.simplify.fold_affine import is_convolution
 
@@ -137,7 +137,7 @@ def compensated(
 
 
 @dataclass(frozen=True)
-class Target:
+class FitTarget:
     """Values that the original network computes at K pixels of a map, to which a convolution is
     fitted.
 
@@ -152,22 +152,22 @@ class Target:
     values: np.ndarray
 
 
-def _targets(networks: Networks, nodes: Sequence[Node]) -> list[list[Target]]:
+def _targets(networks: Networks, nodes: Sequence[Node]) -> list[list[FitTarget]]:
     """Return the results of each convolution for each image, in one run of the original."""
-    targets = [list[Target]() for _ in nodes]
+    targets = [list[FitTarget]() for _ in nodes]
     if not nodes:
         return targets
     generator = np.random.default_rng(0)
     unknowns = [networks.weights(node)[0][0].size for node in nodes]
     outputs = [node.result for node in nodes]
-    for maps in values_of(networks.original, outputs, networks.images):
+    for maps in part_values(networks.original, outputs, networks.images):
         for target, values, count in zip(targets, maps, unknowns, strict=True):
             total = max(LEAST_PIXELS, PIXELS_OF_EACH_UNKNOWN * count)
             height, width = values.shape[2:]
             n_pixels = min(-(-total // len(networks.images)), height * width)
             places = generator.integers(0, height * width, n_pixels)
             rows, columns = np.unravel_index(places, (height, width))
-            target.append(Target(rows, columns, values[0][:, rows, columns].T))
+            target.append(FitTarget(rows, columns, values[0][:, rows, columns].T))
     return targets
 
 
@@ -178,7 +178,7 @@ def _scale_activations(networks: Networks, replaced: Sequence[Node]) -> dict[str
     if not names:
         return {}
     values = list[list[np.ndarray]]()
-    for maps in values_of(networks.original, names, networks.images):
+    for maps in part_values(networks.original, names, networks.images):
         flat = [array[0].reshape(array.shape[1], -1) for array in maps]
         values.append([array[:, :: -(-array.shape[1] // VALUES)] for array in flat])
     columns = [np.concatenate(arrays, axis=1) for arrays in zip(*values, strict=True)]
@@ -232,7 +232,7 @@ def _best_factors(is_swish: bool, source: np.ndarray, result: np.ndarray) -> np.
 
 
 def _fit(
-    networks: Networks, node: Node, targets: Sequence[Target], factors: np.ndarray | None
+    networks: Networks, node: Node, targets: Sequence[FitTarget], factors: np.ndarray | None
 ) -> None:
     """Solve the normal equations of a convolution, group by group.
 
@@ -250,7 +250,7 @@ def _fit(
     groups = node.groups
     equations = Equations(groups, weight[0].size, len(weight) // groups)
     names = [node.source, node.result]
-    adapted = values_of(networks.adapted, names, networks.images)
+    adapted = part_values(networks.adapted, names, networks.images)
     for target, (source, result) in zip(targets, adapted, strict=True):
         expected = target.values if factors is None else target.values * factors
         equations.add(
@@ -324,7 +324,7 @@ class Equations:
 
 
 def _windows(
-    source: np.ndarray, kernel: Pair, window: Window, places: tuple[np.ndarray, np.ndarray]
+    source: np.ndarray, kernel: Sides, window: Window, places: tuple[np.ndarray, np.ndarray]
 ) -> np.ndarray:
     """Return the input windows of a convolution in a map (I, H, W) for its results at some places.
 
@@ -342,7 +342,7 @@ def _windows(
     return padded[:, rows[:, :, None], columns[:, None, :]].swapaxes(0, 1)
 
 
-def values_of(
+def part_values(
     model: onnx.ModelProto, names: Sequence[str], images: Sequence[np.ndarray]
 ) -> Iterator[list[np.ndarray]]:
     """Yield the named tensors for each image; only the nodes in front of them are run."""

@@ -14,7 +14,7 @@ import numpy as np
 import onnx
 from scipy.optimize import nnls
 
-from beers_deploy.quant.adapt.compensation import values_of
+from beers_deploy.quant.adapt.compensation import part_values
 from beers_deploy.quant.graph.normalization import InverseDeviation, Normalization
 
 KNOTS = 3
@@ -45,7 +45,7 @@ def fit_inverses(
     if not normalizations:
         return {}
     sources = [each.source for each in normalizations]
-    maps = zip(*values_of(model, sources, images), strict=True)
+    maps = zip(*part_values(model, sources, images), strict=True)
     inverses = {}
     for each, values in zip(normalizations, maps, strict=True):
         fit = _of_pixels if each.is_of_pixels else _of_image

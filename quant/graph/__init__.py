@@ -46,7 +46,7 @@ from beers_deploy.quant.graph.reader import read_network, refusal
 from beers_deploy.quant.graph.split_network import (
     SplitNetwork,
     channels_of,
-    check_network,
+    check_split,
     require_one_image,
 )
 from beers_deploy.quant.graph.ties import tied, ties_scales
@@ -79,7 +79,7 @@ __all__ = [
     "SplitNetwork",
     "Window",
     "channels_of",
-    "check_network",
+    "check_split",
     "correction_graph",
     "fold_full_scale",
     "graph_to_onnx",

@@ -23,7 +23,7 @@ from beers_deploy.quant.graph.pixel_shuffle import MOVES, ORDERS
 from beers_deploy.quant.graph.split_network import ADAPT, ADAPT_EXACTLY, REMEDY, unsupported
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.resize import Resizing, alone_enlarges_image
-from beers_deploy.quant.onnx.window import Pair, Window
+from beers_deploy.quant.onnx.window import Sides, Window
 from beers_deploy.quant.simplify.convolutions import leaves_pads
 from beers_deploy.quant.simplify.spelled_activations import has_slope_of_dpu, slope_and_offset
 
@@ -111,7 +111,7 @@ def _check_transposed(node: Node) -> None:
         require(value == "NOTSET", node, rule, "State its pads.")
 
 
-def _window(node: Node, kernel: Sequence[int] = ()) -> tuple[Pair, Window]:
+def _window(node: Node, kernel: Sequence[int] = ()) -> tuple[Sides, Window]:
     kernel_and_window = node.window(kernel)
     if kernel_and_window is None:
         raise unsupported(f"{node} must have a window over rows and columns.")

@@ -13,7 +13,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from beers_deploy.profiles.instrument import MAX_DN
-from beers_deploy.quant.onnx.window import Pair, Window
+from beers_deploy.quant.onnx.window import Sides, Window
 
 IMAGE = "image"
 CORRECTION = "correction"
@@ -213,7 +213,7 @@ class MaxPool(OneInput):
         window: strides, pads and dilations.
     """
 
-    kernel: Pair
+    kernel: Sides
     window: Window = field(default_factory=Window)
 
 
@@ -226,7 +226,7 @@ class AveragePool(OneInput):
         window: strides, pads and dilations.
     """
 
-    kernel: Pair | None
+    kernel: Sides | None
     window: Window = field(default_factory=Window)
 
 

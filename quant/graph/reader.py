@@ -36,8 +36,8 @@ from beers_deploy.quant.graph.split_network import (
     AdaptableError,
     SplitNetwork,
     channels_of,
-    check_network,
     check_result_size,
+    check_split,
     cut,
     named_apart,
     require_one_image,
@@ -109,7 +109,7 @@ def read_network(model: ModelProto) -> SplitNetwork:
             base=reader.end.base or network.base,
             adds_image=network.adds_image or reader.end.base is not None,
         )
-        check_network(network)
+        check_split(network)
     # Last, because any other error would remain after adapting.
     if reader.adaptable is not None:
         raise reader.adaptable

@@ -27,7 +27,7 @@ from beers_deploy.quant.graph.operations import (
     Resize,
     Shuffle,
 )
-from beers_deploy.quant.onnx.window import Pair
+from beers_deploy.quant.onnx.window import Sides
 from beers_deploy.quant.untrusted import times
 
 REMEDY = (
@@ -216,7 +216,7 @@ def _is_ours(name: str) -> bool:
     return name in ours or name.startswith(("host_front.", "host_back.", f"{IMAGE}."))
 
 
-def check_network(network: SplitNetwork) -> None:
+def check_split(network: SplitNetwork) -> None:
     """Raise ModelError if a network cannot be quantised, before any work is done.
 
     Its last operation must write the result, its weights must be finite, and no pixel unshuffle of
@@ -246,7 +246,7 @@ def check_network(network: SplitNetwork) -> None:
             raise unsupported(f"The weights of {op.name} contain NaN or infinity.")
 
 
-def sized(graph: Graph, size: Pair) -> Graph:
+def sized(graph: Graph, size: Sides) -> Graph:
     """Return the graph for images of one size, in which global pooling has its whole map as its
     window.
 
@@ -266,7 +266,7 @@ def sized(graph: Graph, size: Pair) -> Graph:
     )
 
 
-def _sizes(graph: Graph, size: Pair) -> dict[str, Pair]:
+def _sizes(graph: Graph, size: Sides) -> dict[str, Sides]:
     """Return the size of every tensor for images of one size."""
     sizes = {IMAGE: size}
     for op in graph:
@@ -311,7 +311,7 @@ def check_result_size(graph: Graph, border_px: int, crop_px: int) -> None:
         )
 
 
-def _size(op: Op, size: Pair) -> Pair:
+def _size(op: Op, size: Sides) -> Sides:
     if isinstance(op, Conv | MaxPool | AveragePool):
         rows, columns = op.weight.shape[2:] if isinstance(op, Conv) else op.kernel or size
         is_transposed = isinstance(op, Conv) and op.transposed

@@ -139,7 +139,7 @@ def merged_correction(core: IntCore, tensors: Mapping[str, np.ndarray]) -> np.nd
     return core.host_part.decode(tensors[CORRECTION] * np.float32(scale), scale)
 
 
-class Sums(NamedTuple):
+class LayerSums(NamedTuple):
     """The integer sums of an operation, before they are shifted and rounded to int8.
 
     Attributes:
@@ -162,7 +162,7 @@ INT8_BITS = 7.0
 
 def layer_sums(
     core: IntCore, op: IntConv | Op, tensors: Mapping[str, np.ndarray], faults: Faults = NO_FAULTS
-) -> Sums:
+) -> LayerSums:
     """Compute the integer sums of an operation, before they are shifted and rounded to int8.
 
     Args:
@@ -180,14 +180,14 @@ def layer_sums(
         product = inputs[0].astype(np.int64) * inputs[1]
         shift = op_shifts(op, core.frac_bits)["shift_cut"]
         # The largest product is that of -128 and -128, which is 2^14.
-        return Sums(product, shift, bound=14.0)
+        return LayerSums(product, shift, bound=14.0)
     if isinstance(op, AveragePool):
-        return Sums(*means(inputs[0], op))
+        return LayerSums(*means(inputs[0], op))
     if isinstance(op, Resize) and op.bilinear:
-        return Sums(*enlarged(inputs[0], op.factor))
+        return LayerSums(*enlarged(inputs[0], op.factor))
     # Values that only move have the same scale, and a table's entries are rounded, so no shift
     # remains.
-    return Sums(_moving(core, op, inputs), 0, INT8_BITS)
+    return LayerSums(_moving(core, op, inputs), 0, INT8_BITS)
 
 
 def _moving(core: IntCore, op: Op, inputs: list[np.ndarray]) -> np.ndarray:
@@ -205,7 +205,7 @@ def _moving(core: IntCore, op: Op, inputs: list[np.ndarray]) -> np.ndarray:
     return np.asarray(activation_table(op, core.frac_bits)[inputs[0] - INT8_MIN])
 
 
-def _conv(core: IntCore, op: IntConv, image: np.ndarray, faults: Faults) -> Sums:
+def _conv(core: IntCore, op: IntConv, image: np.ndarray, faults: Faults) -> LayerSums:
     needed = op_shifts(op, core.frac_bits)
     shift = faults.shifts.get((op.name, "shift_bias"), needed["shift_bias"])
     bias = accumulator_bias(op, shift)
@@ -213,10 +213,10 @@ def _conv(core: IntCore, op: IntConv, image: np.ndarray, faults: Faults) -> Sums
     # The DPU applies the activation to the accumulator, before the one rounding.
     sums, finer = activated(sums, op.activation, op.accumulator_bits(core.frac_bits))
     cut = faults.shifts.get((op.name, "shift_cut"), needed["shift_cut"])
-    return Sums(sums, cut + finer, bound_of(op, bias), finer)
+    return LayerSums(sums, cut + finer, bound_of(op, bias), finer)
 
 
-def _add(core: IntCore, op: Add, inputs: list[np.ndarray], faults: Faults) -> Sums:
+def _add(core: IntCore, op: Add, inputs: list[np.ndarray], faults: Faults) -> LayerSums:
     """Return the exact sum at the finer input's scale, the shift that remains, and its bits."""
     finest = max(core.frac_bits[name] for name in op.inputs)
     shifts = [finest - core.frac_bits[name] for name in op.inputs]
@@ -230,7 +230,7 @@ def _add(core: IntCore, op: Add, inputs: list[np.ndarray], faults: Faults) -> Su
     coarsest = min(core.frac_bits[name] for name in op.inputs)
     needed = op_shifts(op, core.frac_bits)["shift_write"]
     write = faults.shifts.get((op.name, "shift_write"), needed)
-    return Sums(sums, finest - coarsest + write + finer, float(np.log2(bound)), finer)
+    return LayerSums(sums, finest - coarsest + write + finer, float(np.log2(bound)), finer)
 
 
 def rounded(sums: np.ndarray, shift: int, half_even: bool) -> tuple[np.ndarray, float]:

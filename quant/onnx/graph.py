@@ -24,7 +24,7 @@ from onnx import (
 
 from beers_deploy.quant.domains import Functions, functions_of, operator_name, opset_of
 from beers_deploy.quant.onnx.messages import constants, free_name, replace_all, sizes_of
-from beers_deploy.quant.onnx.window import Pair, Window
+from beers_deploy.quant.onnx.window import Sides, Window
 
 WEIGHTS = {"Conv": 1, "ConvInteger": 1, "ConvTranspose": 1, "QLinearConv": 3}
 """Operators with weights, and the input that holds them."""
@@ -129,7 +129,9 @@ class Node:
         proto.output[:] = self.outputs
         return proto
 
-    def window(self, kernel: Sequence[int] = (), size: Pair = (0, 0)) -> tuple[Pair, Window] | None:
+    def window(
+        self, kernel: Sequence[int] = (), size: Sides = (0, 0)
+    ) -> tuple[Sides, Window] | None:
         """Return the kernel of a convolution or pool, and how it moves over the map.
 
         Args:

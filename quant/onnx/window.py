@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-Pair = tuple[int, int]
+Sides = tuple[int, int]
 """Rows and columns."""
 
 
@@ -19,9 +19,9 @@ class Window:
         dilations: the dilations of rows and columns.
     """
 
-    strides: Pair = (1, 1)
+    strides: Sides = (1, 1)
     pads: tuple[int, int, int, int] = (0, 0, 0, 0)
-    dilations: Pair = (1, 1)
+    dilations: Sides = (1, 1)
 
     def extent(self, axis: int, kernel: int) -> int:
         """Return the number of pixels from the first to the last that the window reads along an
@@ -64,7 +64,7 @@ class Window:
         beyond = self.extent(axis, kernel) - self.pads[axis] - self.pads[axis + 2]
         return self.strides[axis] * (size - 1) + beyond
 
-    def padded(self, auto_pad: str, kernel: Pair, size: Pair) -> "Window":
+    def padded(self, auto_pad: str, kernel: Sides, size: Sides) -> "Window":
         """Return the window with the pads that ONNX's attribute `auto_pad` means for a map of one
         size.
 

@@ -45,7 +45,7 @@ from beers_deploy.quant.passes.effort import Effort
 from beers_deploy.quant.passes.equalize_single import SingleTensors
 from beers_deploy.quant.passes.residual_groups import residual_groups, single_tensors
 from beers_deploy.quant.passes.selection import ALL, Passes
-from beers_deploy.quant.plan import Plan, rounded
+from beers_deploy.quant.plan import Plan, carry_out
 from beers_deploy.quant.samples.patches import PATCH_PX, Regenerated
 from beers_deploy.quant.samples.simulated import draw_patches
 from beers_deploy.quant.sensor_bank.conditioned import BANK, ConditionedCore, bank_layer
@@ -232,7 +232,7 @@ def quantize_behind_bank(
     singles = SingleTensors(inner, (weights.variant.features,) * len(inner), by_channel=False)
     groups = residual_groups(graph)
     plan = Plan(graph, host_part, groups, singles, shifts, passes, effort)
-    body, _ = rounded(plan, images)
+    body, _ = carry_out(plan, images)
     biases = {}
     behind_bank = []
     for op in body.ops:

@@ -8,7 +8,7 @@ import torch
 
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
-from beers_deploy.dpu.reading import network_of
+from beers_deploy.dpu.reading import sized_graph
 from beers_deploy.float_onnx import banked_to_onnx, float_for, to_onnx
 from beers_deploy.model.bank import network_bank
 from beers_deploy.model.convbeers import ConvBEERS, arrays, for_sensor, save_network, vector_tensor
@@ -73,7 +73,7 @@ def test_a_network_behind_a_bank_is_exported_for_one_sensor(
             torch.from_numpy(image)
         ).numpy()
     np.testing.assert_allclose(run(open_session(model), image), expected, atol=2e-6)
-    placed = place(network_of(model, 64), load_dpu("vck190", "C32B6"))
+    placed = place(sized_graph(model, 64), load_dpu("vck190", "C32B6"))
     assert [node.op.name for node in placed.nodes if node.broken] == []
     tiling = tiling_of(model)
     assert tiling.alignment_px == scale

@@ -10,7 +10,7 @@ import torch
 
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
-from beers_deploy.dpu.reading import read_network
+from beers_deploy.dpu.reading import read_sized_graph
 from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, save_network
 from beers_deploy.model.training.checkpoint import TrainingRecipe
 from beers_deploy.model.training.source import Batch
@@ -65,7 +65,7 @@ def exported_seeds(_: Path) -> list[bytes]:
 
 def check_onnx(path: Path) -> None:
     """Read a network and place it on a board, as `check` does."""
-    place(read_network(path, SIDE_PX), load_dpu("vck190"))
+    place(read_sized_graph(path, SIDE_PX), load_dpu("vck190"))
 
 
 def analyse_onnx(path: Path) -> None:

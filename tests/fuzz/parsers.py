@@ -17,7 +17,7 @@ from beers_deploy.dpu.cost.model import Layers
 from beers_deploy.dpu.cost.own_runs import read_own_runs
 from beers_deploy.dpu.cost.work import count_work
 from beers_deploy.dpu.graph import SizedGraph
-from beers_deploy.dpu.reading import read_network
+from beers_deploy.dpu.reading import read_sized_graph
 from beers_deploy.model.convbeers import BankedConvBEERS, load_network
 from beers_deploy.model.io.lock import part_folder
 from beers_deploy.model.manifest import matching_lines
@@ -224,7 +224,7 @@ def board_of(path: Path) -> None:
 @cache
 def _network() -> SizedGraph:
     with TemporaryDirectory() as name:
-        return read_network(integer_convbeers(Path(name) / "a.onnx", 1, 2), SIDE_PX)
+        return read_sized_graph(integer_convbeers(Path(name) / "a.onnx", 1, 2), SIDE_PX)
 
 
 LIMITS = [

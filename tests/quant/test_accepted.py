@@ -16,7 +16,7 @@ from beers_deploy.quant.graph import (
     Conv,
     Graph,
     SplitNetwork,
-    check_network,
+    check_split,
     correction_graph,
     read_planes,
 )
@@ -68,9 +68,9 @@ def twice(values: np.ndarray) -> np.ndarray:
 def test_graphs_that_cannot_be_quantized_are_refused(
     corrupt: Callable[[Graph], Graph], message: str, graph: Graph
 ) -> None:
-    check_network(SplitNetwork(graph))
+    check_split(SplitNetwork(graph))
     with pytest.raises(ModelError, match=message):
-        check_network(SplitNetwork(corrupt(graph)))
+        check_split(SplitNetwork(corrupt(graph)))
 
 
 def test_a_layer_that_never_fires_costs_nothing(

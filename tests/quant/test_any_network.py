@@ -15,7 +15,7 @@ from numpy.testing import assert_array_equal
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.checker.table import legality
-from beers_deploy.dpu.reading import network_of
+from beers_deploy.dpu.reading import sized_graph
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.encodings import as_on_board, board_model, encoding_faults, read_core
 from beers_deploy.quant.encodings.description import KEY
@@ -162,7 +162,7 @@ def test_an_invalid_description_raises_no_other_error(
 def test_the_core_is_legal_on_the_dpu(name: str) -> None:
     dpu = load_dpu("vck190", None)
     for file in (quantized(name).host, board_model(quantized(name).core, {})):
-        assert legality(place(network_of(file, 64), dpu), dpu).passed
+        assert legality(place(sized_graph(file, 64), dpu), dpu).passed
 
 
 @EACH

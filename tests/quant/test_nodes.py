@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from onnx import helper
 from onnx.reference import ReferenceEvaluator
 
-from beers_deploy.dpu.reading import network_of
+from beers_deploy.dpu.reading import sized_graph
 from beers_deploy.quant.graph.pixel_shuffle import MOVES
 from tests.quant.quick import run_model
 from tests.quant.tiling.small_networks import Row, taps
@@ -46,7 +46,7 @@ def with_offset_windows(draw: st.DrawFn) -> Row:
 @given(with_offset_windows(), st.integers(5, 13))
 def test_sizes_are_the_runtimes_own(row: Row, side: int) -> None:
     model = row.model()
-    shape = network_of(model, side).operations[0].out_shape
+    shape = sized_graph(model, side).operations[0].out_shape
     # A window that is larger than its map has no size.
     assume(shape is not None)
     result = run_model(model, np.zeros((1, 1, side, side), np.float32))

@@ -12,7 +12,7 @@ import onnxruntime as ort
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from beers_deploy.dpu.reading import network_of
+from beers_deploy.dpu.reading import sized_graph
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import load_onnx, parse_onnx
 from beers_deploy.quant.session import open_session, result_of, run
@@ -215,7 +215,7 @@ def test_unknown_opsets_are_refused_and_batches_where_images_come_singly(
         with pytest.raises(ModelError, match="opset"):
             load_onnx(tmp_path / "opset.onnx", to_run)
     four.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 4
-    for reader in (tiling_of, partial(network_of, tile_px=64)):
+    for reader in (tiling_of, partial(sized_graph, tile_px=64)):
         with pytest.raises(ModelError, match=r"4"):
             reader(four)
 

@@ -23,9 +23,9 @@ from beers_deploy.studies.stress.bit_flips import (
     FaultTarget,
     curve_rows,
     flip_curves_svg,
+    guard_rows,
     make_target,
     name_of,
-    price_rows,
 )
 from beers_deploy.studies.stress.faults import (
     MEMORIES,
@@ -127,7 +127,7 @@ def test_all_guards_cost_under_two_per_cent_on_the_board(variant: str) -> None:
     }
     dpu = load_dpu("vck190", None)
     target = FaultTarget(core, Guards(relus, 1024.0, checksums(core)), (), ())
-    prices = price_rows(target, predict_network(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
+    prices = guard_rows(target, predict_network(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
     *parts, together = (db(row, "time") for row in prices)
     assert together == pytest.approx(sum(parts))
     assert 0 < db(prices[-1], "of a tile, if nothing hides") < 2
@@ -181,7 +181,7 @@ def test_the_page_is_fresh() -> None:
     dpu = load_dpu("vck190", None)
     for variant in maker.VARIANTS:
         target = make_target(open_subject(variant), maker.SOURCE)
-        rows = price_rows(target, predict_network(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
+        rows = guard_rows(target, predict_network(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
         assert all(line in page for line in maker.price_lines({variant: rows}))
     for name, memory in MEMORIES.items():
         assert page.count(f"\n| {name}, ") == len(memory.rates)

@@ -114,7 +114,7 @@ class Broken:
     finding: Finding
 
 
-def judge(op: Operation, dpu: Dpu, quantized: bool) -> tuple[Broken, ...]:
+def broken_rules(op: Operation, dpu: Dpu, quantized: bool) -> tuple[Broken, ...]:
     """Check one operation against all rules for its kind.
 
     A compiler may convert an operation to another form (`forms`), so it passes if one of its forms
@@ -189,7 +189,7 @@ def all_rules() -> Iterator[Rule]:
     yield from dict.fromkeys(chain.from_iterable(tables))
 
 
-def require_known(dpu: Dpu) -> None:
+def require_known_constants(dpu: Dpu) -> None:
     """Raise ProfileError if the board's file has a constant that no rule names.
 
     A misspelt constant would silently disable the rule that it is meant for.

@@ -19,7 +19,7 @@ from itertools import chain
 from typing import Literal
 
 from beers_deploy.dpu.board import Dpu
-from beers_deploy.dpu.checker.operators import Broken, judge, require_known
+from beers_deploy.dpu.checker.operators import Broken, broken_rules, require_known_constants
 from beers_deploy.dpu.graph import CONVOLUTIONS, Operation, SizedGraph
 from beers_deploy.quant.domains import is_foreign
 from beers_deploy.quant.graph.ties import united
@@ -149,7 +149,7 @@ def place(network: SizedGraph, dpu: Dpu) -> Placement:
         ProfileError: the board's file has a constant that no rule reads, probably misspelt.
     """
     # A misspelt constant would silence the rule that it is for.
-    require_known(dpu)
+    require_known_constants(dpu)
     convolutions = [op for op in network.operations if op.kind in CONVOLUTIONS]
     behind = _computed_from(network.operations, convolutions)
     before = _leading_to(network.operations, convolutions)
@@ -158,7 +158,7 @@ def place(network: SizedGraph, dpu: Dpu) -> Placement:
     devices: list[Device] = []
     on_cpu: set[str] = set()
     for number, op in enumerate(network.operations):
-        rules = judge(op, dpu, network.quantized) if parts[number] == "dpu-core" else ()
+        rules = broken_rules(op, dpu, network.quantized) if parts[number] == "dpu-core" else ()
         broken.append(rules)
         if parts[number] != "dpu-core":
             devices.append("host")

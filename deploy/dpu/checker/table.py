@@ -12,7 +12,7 @@ import onnx
 from beers_deploy.dpu.board import Dpu, device_of
 from beers_deploy.dpu.checker.placement import PlacedNode, Placement, place
 from beers_deploy.dpu.checker.remarks import is_island, remarks_on
-from beers_deploy.dpu.reading import network_of, usual_tile_px
+from beers_deploy.dpu.reading import sized_graph, usual_tile_px
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import ModelError
@@ -102,7 +102,7 @@ def check_network(
     build = device_of(target, dpu)
     core = as_on_board(source.model)
     tile_px = usual_tile_px(core) if tile is None else tile
-    sized = network_of(core, tile_px, source.label)
+    sized = sized_graph(core, tile_px, source.label)
     placement = place(sized, build)
     quantized = is_quantized(source.model)
     # A float file or a host's file is not for a compiler.

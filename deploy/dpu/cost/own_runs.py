@@ -17,7 +17,7 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 from beers_deploy.dpu.board import Dpu, Levels, dpu_of
 from beers_deploy.dpu.checker.placement import Placement, place
 from beers_deploy.dpu.cost.latency import Prediction, predict
-from beers_deploy.dpu.reading import read_network
+from beers_deploy.dpu.reading import read_sized_graph
 from beers_deploy.profiles.errors import OptionError, counted, printable
 from beers_deploy.profiles.figures import Row, predicted, published
 from beers_deploy.profiles.json_text import read_json
@@ -173,7 +173,7 @@ def _run(entry: Entry, path: Path, where: str, board: Dpu) -> Run:
         )
     dpu = dpu_of(target, entry.configuration)
     model = path.parent / entry.model
-    placement = place(read_network(model, entry.tile_px), dpu)
+    placement = place(read_sized_graph(model, entry.tile_px), dpu)
     prediction = predict(placement, dpu)
     if not prediction.fps / FAR <= entry.fps <= prediction.fps * FAR:
         raise OptionError(

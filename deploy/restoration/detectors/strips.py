@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from beers_deploy.model.metrics.detector_lines import Blocks, join_blocks, measure_lines
+from beers_deploy.model.metrics.detector_lines import LineBlocks, join_blocks, measure_lines
 from beers_deploy.model.metrics.detector_phases import (
     COLOUR,
     Pattern,
@@ -142,8 +142,8 @@ class StripMeasures(NamedTuple):
         checked_px: the number of pixels that are not missing.
     """
 
-    columns: Blocks
-    rows: Blocks
+    columns: LineBlocks
+    rows: LineBlocks
     numbers: range
     phases: list[tuple[np.ndarray, np.ndarray]]
     pixels: np.ndarray

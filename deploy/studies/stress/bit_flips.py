@@ -75,7 +75,7 @@ def flip_table(subject: Subject, source: Calibration, board: TargetProfile) -> T
     return Table(
         command="stress",
         inputs=subject.inputs,
-        rows=(*curves, *price_rows(target, prediction, dpu)),
+        rows=(*curves, *guard_rows(target, prediction, dpu)),
         notes=(CURVE_NOTE, GUARD_NOTE),
         headings=HEADINGS,
     )
@@ -289,7 +289,7 @@ AT_ONCE = 16
 INSTRUCTIONS = 2
 
 
-def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Row]:
+def guard_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Row]:
     """Predict the cost of each guard against bit flips, and of all of them, on a board.
 
     Args:

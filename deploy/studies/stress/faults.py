@@ -23,7 +23,7 @@ MEGABIT = 1e6
 INT8_BITS = 8
 PIXEL_BITS = 12
 SHIFT_BITS = 6
-Shifts = dict[tuple[str, str], int]
+ShiftValues = dict[tuple[str, str], int]
 """Shifts by operation and field, as `Faults` accepts them."""
 
 
@@ -135,12 +135,12 @@ def map_channels(core: IntCore) -> dict[str, int]:
     return channels_of(core.ops, {PLANES: core.host_part.planes})
 
 
-def shifts_of(core: IntCore) -> Shifts:
+def shifts_of(core: IntCore) -> ShiftValues:
     """Return the shifts, which scale sums by powers of two, by the names of operation and field.
 
     The field shift_read of an add is left out: it is 0, because a stream shares one scale.
     """
-    shifts: Shifts = {}
+    shifts: ShiftValues = {}
     for op in core.ops:
         for field, value in op_shifts(op, core.frac_bits).items():
             if field != "shift_read":
@@ -148,14 +148,14 @@ def shifts_of(core: IntCore) -> Shifts:
     return shifts
 
 
-def bits_apart(shifts: Shifts, others: Shifts) -> int:
+def bits_apart(shifts: ShiftValues, others: ShiftValues) -> int:
     """Return the number of bits in which two sets of shifts differ, with six bits in each shift."""
     return sum(
         ((shifts[key] ^ others[key]) & ((1 << SHIFT_BITS) - 1)).bit_count() for key in shifts
     )
 
 
-def flip_shifts(shifts: Shifts, count: int, generator: np.random.Generator) -> Shifts:
+def flip_shifts(shifts: ShiftValues, count: int, generator: np.random.Generator) -> ShiftValues:
     """Return shifts with `count` different random bits of them flipped, of six bits in each."""
     raw = flip_bits(np.array(list(shifts.values()), np.int16), count, generator, SHIFT_BITS)
     return dict(zip(shifts, raw.tolist(), strict=True))
@@ -236,7 +236,7 @@ def scrubbed(core: IntCore, intact: IntCore, checks: Mapping[str, int]) -> IntCo
     return with_ops(core, (op for op in intact.convolutions if op.name in wrong))
 
 
-def voted(copies: tuple[Shifts, Shifts, Shifts]) -> Shifts:
+def voted(copies: tuple[ShiftValues, ShiftValues, ShiftValues]) -> ShiftValues:
     """Return the majority of three copies of the shifts, bit by bit (triple modular redundancy)."""
     a, b, c = copies
     return {key: (a[key] & b[key]) | (a[key] & c[key]) | (b[key] & c[key]) for key in a}
@@ -306,7 +306,7 @@ def _shifts(
     return Injected(core, Faults(wrong), image, bits_apart(wrong, shifts_of(core)))
 
 
-def _flip_copy(core: IntCore, per_megabit: float, generator: np.random.Generator) -> Shifts:
+def _flip_copy(core: IntCore, per_megabit: float, generator: np.random.Generator) -> ShiftValues:
     shifts = shifts_of(core)
     count = flip_count(SHIFT_BITS * len(shifts), per_megabit, generator)
     return flip_shifts(shifts, count, generator)

@@ -19,7 +19,7 @@ from beers_deploy.dpu.board import Dpu, dpu_of
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import dpu_power, predict
 from beers_deploy.dpu.graph import SizedGraph
-from beers_deploy.dpu.reading import network_of
+from beers_deploy.dpu.reading import sized_graph
 from beers_deploy.model.shipped import shipped_names
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.performance import tables
@@ -260,7 +260,7 @@ def network_of_variant(variant: Variant) -> Network:
 
 @cache
 def _graph(network: Network, tile_px: int) -> SizedGraph:
-    return network_of(network.model, tile_px, network.label)
+    return sized_graph(network.model, tile_px, network.label)
 
 
 UNITS: dict[str, str] = {

@@ -13,7 +13,7 @@ import onnx
 
 from beers_deploy.dpu.board import Dpu, load_dpu
 from beers_deploy.dpu.checker.placement import PlacedNode, Placement, place
-from beers_deploy.dpu.reading import read_network
+from beers_deploy.dpu.reading import read_sized_graph
 from tests.deploy.dpu.graphs import SAME, written
 
 DPU = load_dpu("vck190")
@@ -29,7 +29,7 @@ def as_written() -> Iterator[None]:
 
 def placed_file(path: Path, tile_px: int = TILE_PX, dpu: Dpu = DPU) -> Placement:
     """Read a file, and place its nodes on a DPU."""
-    return place(read_network(path, tile_px), dpu)
+    return place(read_sized_graph(path, tile_px), dpu)
 
 
 def placed(model: onnx.ModelProto, tile_px: int = TILE_PX, dpu: Dpu = DPU) -> Placement:

@@ -14,7 +14,7 @@ from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.checker.remarks import REMARKS
 from beers_deploy.dpu.cost.latency import dpu_power
 from beers_deploy.dpu.graph import Operation
-from beers_deploy.dpu.reading import network_of
+from beers_deploy.dpu.reading import sized_graph
 from beers_deploy.model.shipped import shipped_names
 from beers_deploy.performance.swath import efficiency, energy
 from beers_deploy.profiles.figures import predicted
@@ -182,7 +182,7 @@ def test_a_smaller_dpu_has_a_smaller_array_and_smaller_banks(name: str, size: st
 
 @pytest.mark.parametrize("variant", shipped_names())
 def test_the_shipped_files_run_whole_on_every_board(variant: str) -> None:
-    network = network_of(load_onnx(shipped_pair(variant)[1]), 128)
+    network = sized_graph(load_onnx(shipped_pair(variant)[1]), 128)
     for name, dpu in DPUS.items():
         placement = place(network, dpu)
         assert placement.dpu_subgraphs == 1, name

@@ -15,7 +15,7 @@ from onnx import numpy_helper
 from beers_deploy.dpu.checker import number_rules
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.graph import Operation
-from beers_deploy.dpu.reading import network_of
+from beers_deploy.dpu.reading import sized_graph
 from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.encodings import board_model
@@ -32,7 +32,7 @@ HALF = Scale((0.5,), (0,), "int8")
 def rules(model: onnx.ModelProto) -> set[str]:
     """Return the rules that the nodes break, without the metadata that only our files have."""
     del model.metadata_props[:]
-    return set(rules_of(place(network_of(model, 64), DPU).nodes))
+    return set(rules_of(place(sized_graph(model, 64), DPU).nodes))
 
 
 @cache

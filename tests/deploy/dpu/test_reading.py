@@ -5,7 +5,7 @@ import onnx
 import pytest
 from onnx.helper import set_model_props
 
-from beers_deploy.dpu.reading import own_tile_px, read_network, usual_tile_px
+from beers_deploy.dpu.reading import own_tile_px, read_sized_graph, usual_tile_px
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.encodings import BORDER_PX, PLACE_PX, board_model
 from beers_deploy.quant.onnx_file import metadata, save_onnx
@@ -18,7 +18,9 @@ from tests.quant.tiling.small_networks import quantized_half_resolution
 def test_a_board_file_keeps_only_the_conversions_at_its_border_and_its_numbers(
     tmp_path: Path,
 ) -> None:
-    first, *middle, last = read_network(board_convbeers(tmp_path / "b.onnx", 3, 8), 64).operations
+    first, *middle, last = read_sized_graph(
+        board_convbeers(tmp_path / "b.onnx", 3, 8), 64
+    ).operations
     assert (first.kind, last.kind) == ("quantize", "dequantize")
     assert {op.kind for op in middle}.isdisjoint(("quantize", "dequantize"))
     conv = next(op for op in middle if op.kind == "conv")
@@ -30,7 +32,7 @@ def test_a_board_file_keeps_only_the_conversions_at_its_border_and_its_numbers(
 
 def test_an_unknown_operator_hides_the_shape_but_not_the_network(tmp_path: Path) -> None:
     onnx.save(written(MYSTERY), tmp_path / "m.onnx")
-    after = read_network(tmp_path / "m.onnx", 30).operations[-1]
+    after = read_sized_graph(tmp_path / "m.onnx", 30).operations[-1]
     assert after.out_shape is None
     with pytest.raises(ModelError, match="hides the shape"):
         _ = after.operations
@@ -42,16 +44,16 @@ def test_an_unknown_operator_hides_the_shape_but_not_the_network(tmp_path: Path)
 def test_maps_are_joined_along_any_axis(axis: int, shape: tuple[int, ...], tmp_path: Path) -> None:
     model = written(f"a = {SAME}(image, w) b = {SAME}(image, w) y = Concat<axis={axis}>(a, b)")
     onnx.save(model, tmp_path / "j.onnx")
-    assert read_network(tmp_path / "j.onnx", 30).operations[-1].out_shape == shape
+    assert read_sized_graph(tmp_path / "j.onnx", 30).operations[-1].out_shape == shape
 
 
 def test_a_model_fixed_to_another_tile_is_refused_with_its_tile(tmp_path: Path) -> None:
     model = written(f"y = {SAME}(image, w)")
     fix_sizes(model.graph.input[0], 48, 48)
     onnx.save(model, tmp_path / "f.onnx")
-    assert read_network(tmp_path / "f.onnx", 48).operations[0].out_shape == (8, 48, 48)
+    assert read_sized_graph(tmp_path / "f.onnx", 48).operations[0].out_shape == (8, 48, 48)
     with pytest.raises(ModelError, match="`tile` 48"):
-        read_network(tmp_path / "f.onnx", 640)
+        read_sized_graph(tmp_path / "f.onnx", 640)
 
 
 def test_inputs_that_are_no_images_are_refused(tmp_path: Path) -> None:
@@ -59,7 +61,7 @@ def test_inputs_that_are_no_images_are_refused(tmp_path: Path) -> None:
     del model.graph.input[0].type.tensor_type.shape.dim[3]
     onnx.save(model, tmp_path / "i.onnx")
     with pytest.raises(ModelError, match="inputs"):
-        read_network(tmp_path / "i.onnx")
+        read_sized_graph(tmp_path / "i.onnx")
 
 
 @pytest.mark.parametrize("on_board", [False, True])
@@ -71,12 +73,12 @@ def test_the_core_of_a_network_at_half_resolution_has_maps_of_half_the_tile(
     model = board_model(network.core, {}) if on_board else network.host
     save_onnx(model, tmp_path / "half.onnx")
     convolutions = [
-        op for op in read_network(tmp_path / "half.onnx", 64).operations if op.kind == "conv"
+        op for op in read_sized_graph(tmp_path / "half.onnx", 64).operations if op.kind == "conv"
     ]
     assert {op.out_shape[1:] for op in convolutions if op.out_shape} == {(32, 32)}
     assert convolutions[0].channels[0] == 3 * 4
     with pytest.raises(ModelError, match=r"`tile` must be a multiple of 2 px .*got 63 px"):
-        read_network(tmp_path / "half.onnx", 63)
+        read_sized_graph(tmp_path / "half.onnx", 63)
 
 
 def test_a_core_at_half_resolution_that_is_fixed_to_a_tile_is_fixed_to_half_of_it(
@@ -88,7 +90,7 @@ def test_a_core_at_half_resolution_that_is_fixed_to_a_tile_is_fixed_to_half_of_i
     assert own_tile_px(fixed) == 64
     save_onnx(fixed, tmp_path / "fixed.onnx")
     with pytest.raises(ModelError, match=r"fixed to 64 x 64 pixels.*Give `tile` 64"):
-        read_network(tmp_path / "fixed.onnx", 66)
+        read_sized_graph(tmp_path / "fixed.onnx", 66)
 
 
 @pytest.mark.parametrize(("place_px", "border_px"), [(1, 0), (3, 0), (3, 2), (7, 5)])
@@ -100,7 +102,7 @@ def test_the_usual_tile_has_whole_places(place_px: int, border_px: int, tmp_path
     tile_px = usual_tile_px(model)
     assert 640 <= tile_px < 640 + place_px
     save_onnx(model, tmp_path / "core.onnx")
-    assert read_network(tmp_path / "core.onnx", tile_px).operations
+    assert read_sized_graph(tmp_path / "core.onnx", tile_px).operations
     fixed = board_model(quantized_half_resolution().core, {}, 64)
     assert usual_tile_px(fixed) == 64
 
@@ -118,4 +120,4 @@ def test_impossible_places_are_refused(text: str, tmp_path: Path) -> None:
     next(entry for entry in model.metadata_props if entry.key == PLACE_PX).value = text
     save_onnx(model, tmp_path / "half.onnx")
     with pytest.raises(ModelError, match="contradict"):
-        read_network(tmp_path / "half.onnx", 64)
+        read_sized_graph(tmp_path / "half.onnx", 64)

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
-from beers_deploy.dpu.reading import network_of
+from beers_deploy.dpu.reading import sized_graph
 from beers_deploy.model.bank import LARGEST, bank_of_vector
 from beers_deploy.model.convbeers import BankedConvBEERS, Rounding, initialise
 from beers_deploy.model.io.tensors import Weights
@@ -314,7 +314,7 @@ def test_the_dpu_runs_every_operation(pair: Pair) -> None:
     core = core_of(pair[1], SENSORS[2])
     assert shift_faults(core) == []
     board = board_model(core, {}, 64)
-    placed = place(network_of(board, 64), load_dpu("vck190", "C32B6"))
+    placed = place(sized_graph(board, 64), load_dpu("vck190", "C32B6"))
     assert [node.op.name for node in placed.nodes if node.broken] == []
     size = board.graph.input[0].type.tensor_type.shape.dim[2].dim_value
     assert size == (70 if core.host_part.place_px == 1 else 36)

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from beers_deploy.cli.commands import app
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
-from beers_deploy.dpu.reading import read_network
+from beers_deploy.dpu.reading import read_sized_graph
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import load_onnx, read_onnx
 from tests.quant.quick import assert_same, uniform
@@ -55,7 +55,7 @@ def test_a_file_that_no_runtime_may_open_is_refused_and_can_be_inspected(
         load_onnx(path)
     refused = [
         placement.op.op_type.rpartition("::")[2]
-        for placement in place(read_network(path, 32), load_dpu("vck190")).failed
+        for placement in place(read_sized_graph(path, 32), load_dpu("vck190")).failed
     ]
     assert words.split()[0] in refused
 

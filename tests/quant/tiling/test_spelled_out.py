@@ -10,7 +10,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import nn
 
-from beers_deploy.dpu.reading import network_of
+from beers_deploy.dpu.reading import sized_graph
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph import read_network
 from beers_deploy.quant.graph.pixel_shuffle import with_shuffles
@@ -109,6 +109,6 @@ def test_operators_that_move_integers_are_integer_operators() -> None:
         moved = QuantizeLinear(less, unit, zero)
         restored = DequantizeLinear(moved, unit, zero)
     """
-    operations = network_of(network(nodes, NUMBERS), 8).operations
+    operations = sized_graph(network(nodes, NUMBERS), 8).operations
     kinds = [(op.kind, op.integer) for op in operations]
     assert kinds == [("quantize", True), ("pixel shuffle", True), ("dequantize", False)]
