@@ -107,6 +107,10 @@ class Instrument:
         """The digital number of a pixel without light; 0 without an offset."""
         return float(getattr(self.effects.get(OFFSET), "offset_dn", 0))
 
+    def dark_value(self, full_scale: float) -> float:
+        """Return the pixel value without light, if the largest digital number is `full_scale`."""
+        return self.offset_dn * full_scale / self.max_dn
+
     @property
     def antialias_px(self) -> float:
         """Standard deviation of the anti-alias filter in pixels of this sensor; 0 without one."""
@@ -260,4 +264,4 @@ def pixel_noise(sensor: Instrument, full_scale: float, patterns: float = 1) -> P
         elif isinstance(effect, Prnu):
             square = patterns * effect.rms**2
     growth = sensor.alpha * gain * unit
-    return PixelNoise(dark * unit**2, growth, square, sensor.offset_dn * full_scale / sensor.max_dn)
+    return PixelNoise(dark * unit**2, growth, square, sensor.dark_value(full_scale))

@@ -19,6 +19,7 @@ from onnx import ModelProto, helper
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.figures import Check
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.quant.adapt.kinds import Kind, nodes_by_kind
 from beers_deploy.quant.bounds import within_int8
 from beers_deploy.quant.core import IntConv, IntCore
@@ -303,7 +304,7 @@ def structure_checks(
     sizes = [side.dim_value for side in int8.graph.input[0].type.tensor_type.shape.dim]
     alignment_px = 1 if sizes[2] else tiling_of(int8).alignment_px
     rows, columns = (
-        fixed or -(-n // alignment_px) * alignment_px
+        fixed or up_to_multiple(n, alignment_px)
         for fixed, n in zip(sizes[2:], (97, 101), strict=True)
     )
     image = np.random.default_rng(0).random((1, sizes[1] or 1, rows, columns), dtype=np.float32)

@@ -18,6 +18,7 @@ import onnx
 from beers_deploy.dpu.graph import Kind, Operation, Shape, SizedGraph, kind_of, out_shape
 from beers_deploy.model.bank import GAINS, LARGEST, WIDE
 from beers_deploy.profiles.errors import ModelError, printable
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.quant.encodings import BORDER_PX, PLACE_PX, as_on_board
 from beers_deploy.quant.graph.pixel_shuffle import with_shuffles
@@ -85,7 +86,7 @@ def usual_tile_px(model: onnx.ModelProto) -> int:
     # A network that cannot be tiled may accept any size.
     with suppress(ModelError):
         place_px *= tiling_of(model).alignment_px
-    whole_px = place_px * -(-(TILE_PX + 2 * border_px) // place_px)
+    whole_px = up_to_multiple(TILE_PX + 2 * border_px, place_px)
     return own_tile_px(model) or whole_px - 2 * border_px
 
 

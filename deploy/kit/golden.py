@@ -24,6 +24,7 @@ from beers_deploy.profiles.arrays import ALONE, load_arrays
 from beers_deploy.profiles.errors import ImageError, OptionError, printable
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.json_text import read_json
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.profiles.shipped import DEFAULT_TARGET
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.profiles.user_files import unreadable
@@ -171,7 +172,7 @@ def _images(
     """Return the images (1, C, H, W) of the cases, by name."""
     fixed_px = fixed_tile_px(network.model)
     alignment_px = fixed_px or network.tiling.alignment_px
-    side = fixed_px or tile or -(-GOLDEN_TILE_PX // alignment_px) * alignment_px
+    side = fixed_px or tile or up_to_multiple(GOLDEN_TILE_PX, alignment_px)
     if (tile or side) != side or side < 1 or side % alignment_px:
         rule = (
             f"{fixed_px} px, the network's own size"

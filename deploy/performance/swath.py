@@ -28,7 +28,6 @@ from beers_deploy.quant.encodings import CORE, read_core
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.restoration.plan import make_plan, plan_side
-from beers_deploy.restoration.steps import offset_of
 from beers_deploy.restoration.tiles.exposures import tiles_by_factor
 
 COST_SOURCE = "cost model fitted on published networks, docs/explanation/cost-model.md"
@@ -131,8 +130,9 @@ def exposed(
     """
     plan = make_plan((1, *dn.shape), swath.tile_px, swath.halo_px, tiling)
     # The board runs the network in INT8.
-    factors = [exposure.factor for exposure in exposures_for(sensor.nominal(), int8=True)]
-    counts = tiles_by_factor(dn, plan, factors, MAX_DN, offset_of(sensor, MAX_DN))
+    instrument = sensor.nominal()
+    factors = [exposure.factor for exposure in exposures_for(instrument, int8=True)]
+    counts = tiles_by_factor(dn, plan, factors, MAX_DN, instrument.dark_value(MAX_DN))
     total = sum(counts.values())
     shares = ", ".join(f"x{factor:g} {count / total:.0%}" for factor, count in counts.items())
     words = (

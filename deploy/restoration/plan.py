@@ -14,6 +14,7 @@ from typing import NamedTuple
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import ModelError, OptionError, counted, printable
 from beers_deploy.profiles.figures import Figure, predicted
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.quant.tiling.receptive_field import Tiling
 
@@ -113,7 +114,7 @@ def plan_side(
         OptionError: the halo is negative, or a tile is too small for the network, or to retain
             `alignment_px` pixels between two halos.
     """
-    smallest_px = max(2 * halo_px + alignment_px, _up(min_side_px, alignment_px))
+    smallest_px = max(2 * halo_px + alignment_px, up_to_multiple(min_side_px, alignment_px))
     if tile_px < smallest_px or halo_px < 0:
         least = f", at least {smallest_px} px" if smallest_px > 2 * halo_px + 1 else ""
         raise OptionError(
@@ -121,7 +122,7 @@ def plan_side(
             "Use larger tiles or a smaller halo."
         )
     # The strides of a network sample other pixels in a tile that begins or ends off the lattice.
-    extended_px = _up(max(size_px, min_side_px), alignment_px)
+    extended_px = up_to_multiple(max(size_px, min_side_px), alignment_px)
     side_px = min(tile_px // alignment_px * alignment_px, extended_px)
     spans = []
     done = 0
@@ -134,10 +135,6 @@ def plan_side(
         spans.append(Span(start, stop, done, keep_stop))
         done = keep_stop
     return spans
-
-
-def _up(size_px: int, alignment_px: int) -> int:
-    return -(-size_px // alignment_px) * alignment_px
 
 
 def even_side_px(
@@ -158,8 +155,8 @@ def even_side_px(
     """
     # A last tile that is moved inward computes pixels twice; even tiles compute fewer.
     count = len(plan_side(size_px, tile_px, halo_px, alignment_px, min_side_px))
-    even_px = -(-(_up(size_px, alignment_px) + 2 * halo_px * (count - 1)) // count)
-    return max(_up(max(even_px, min_side_px), alignment_px), 2 * halo_px + alignment_px)
+    even_px = -(-(up_to_multiple(size_px, alignment_px) + 2 * halo_px * (count - 1)) // count)
+    return max(up_to_multiple(max(even_px, min_side_px), alignment_px), 2 * halo_px + alignment_px)
 
 
 @dataclass(frozen=True)

@@ -103,22 +103,11 @@ def exposed_networks(
         infers = {factor: opened(other.model) for factor, other in others.items()}
         offset = 0.0
         if network.profile is not None and others:
-            offset = offset_of(network.profile, full_scale)
+            offset = network.profile.nominal().dark_value(full_scale)
         infer = opened(network.model)
         infers = {1: partial(in_ranges, infer, ranges) if ranges else infer, **infers}
         built.append(ExposedNetwork(infers, tiling.halo_px, offset))
     return tuple(built)
-
-
-def offset_of(sensor: Sensor, full_scale: float) -> float:
-    """Return the pixel value that a sensor stores without light.
-
-    Args:
-        sensor: the sensor's profile. If it states ranges, the middle of each is used.
-        full_scale: the pixel value that is the sensor's largest digital number.
-    """
-    instrument = sensor.nominal()
-    return instrument.offset_dn * full_scale / instrument.max_dn
 
 
 def consistency_steps(

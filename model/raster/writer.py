@@ -25,6 +25,7 @@ from beers_deploy.model.raster.facts import RESTORED, BandInfo, Raster
 from beers_deploy.model.raster.reader import LEAST_CACHE_BYTES, OFFLINE, gdal
 from beers_deploy.model.raster.source import strips
 from beers_deploy.profiles.errors import CODE_FAULTS, OptionError
+from beers_deploy.profiles.rounding import up_to_multiple
 
 RGB = [ColorInterp.red, ColorInterp.green, ColorInterp.blue]
 TILE_PX = 256
@@ -258,7 +259,7 @@ def padded_px(shape: tuple[int, int, int], tile_px: int = TILE_PX) -> int:
         tile_px: the side of a tile, by default that of the TIFFs that are written here.
     """
     bands, height, width = shape
-    return bands * -(-height // tile_px) * -(-width // tile_px) * tile_px**2
+    return bands * up_to_multiple(height, tile_px) * up_to_multiple(width, tile_px)
 
 
 def cog_bytes(shape: tuple[int, int, int], itemsize: int) -> int:

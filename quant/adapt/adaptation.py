@@ -16,6 +16,7 @@ import onnx
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.figures import Figure, Row
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.quant.adapt.compensation import compensated
 from beers_deploy.quant.adapt.inverse_deviation import fit_inverses
 from beers_deploy.quant.adapt.kinds import APPROXIMATIONS, EXACT, Kind, nodes_by_kind
@@ -191,7 +192,7 @@ def _fit_images(model: onnx.ModelProto, images: Sequence[np.ndarray]) -> list[np
         except ModelError:
             # Perhaps an operator that is to be replaced prevents tiling.
             alignment_px = FIT_PX
-        side_px = -(-FIT_PX // alignment_px) * alignment_px
+        side_px = up_to_multiple(FIT_PX, alignment_px)
     else:
         count = int(np.clip(FIT_IMAGES * FIT_PX**2 // side_px**2, FEWEST_FIT_IMAGES, FIT_IMAGES))
     places = np.unique(np.linspace(0, len(images) - 1, count).astype(int))

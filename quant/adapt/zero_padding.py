@@ -9,6 +9,7 @@ import numpy as np
 import onnx
 
 from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Replacement
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 
@@ -56,7 +57,7 @@ def pad_by_zeros(model: onnx.ModelProto) -> None:
             "whole image, and the replacement adds a mirrored border to the image. Pad by zeros, "
             "and train the network again."
         ) from error
-    border_px = -(-MIRRORED_PX // tiling.alignment_px) * tiling.alignment_px
+    border_px = up_to_multiple(MIRRORED_PX, tiling.alignment_px)
     crop_px = int(border_px * tiling.scale)
     (image,) = graph.inputs
     (result,) = graph.outputs

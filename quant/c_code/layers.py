@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.quant.core import IntConv, IntCore, op_shifts
 from beers_deploy.quant.graph import (
     Activation,
@@ -274,11 +275,11 @@ def _conv(w: LayerWriter, op: IntConv) -> None:
     depth = rows * inputs
     # A run also has the columns between dilated taps, whose weights are zero. It is rounded up to
     # whole LANES, and the last pixel's run ends the line.
-    run = -(-((columns - 1) * window.dilations[1] + 1) * depth // LANES) * LANES
+    run = up_to_multiple(((columns - 1) * window.dilations[1] + 1) * depth, LANES)
     line = (w.shapes[op.output][2] - 1) * window.strides[1] * depth + run
     w.line_length = max(w.line_length, line)
     # The kernel computes CHANNELS output channels at a time, so the weights of a group are padded.
-    channels = -(-outputs // op.groups // CHANNELS) * CHANNELS
+    channels = up_to_multiple(outputs // op.groups, CHANNELS)
     w.weights_length = max(w.weights_length, channels * run)
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 from onnx import TensorProto
 
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.quant.graph import (
     CORRECTION,
     IMAGE,
@@ -110,7 +111,7 @@ class HostPart(HostSteps):
     def border_px(self) -> int:
         """The number of pixels by which the image is mirrored beyond its borders."""
         # Rounded up, so that pixel unshuffling divides the image into the same places as before.
-        return -(-self.encoding.margin_px // self.place_px) * self.place_px
+        return up_to_multiple(self.encoding.margin_px, self.place_px)
 
     @property
     def image_channels(self) -> int:

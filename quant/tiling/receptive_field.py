@@ -29,6 +29,7 @@ import numpy as np
 from onnx import ModelProto, TypeProto
 
 from beers_deploy.profiles.errors import ModelError, counted
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.quant.graph.pixel_shuffle import MOVES, with_shuffles
 from beers_deploy.quant.onnx.elementwise import ELEMENTWISE
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
@@ -77,7 +78,7 @@ class Tiling:
         Args:
             side_px: the length of the side.
         """
-        return -(-max(side_px, self.min_side_px) // self.alignment_px) * self.alignment_px
+        return up_to_multiple(max(side_px, self.min_side_px), self.alignment_px)
 
     @property
     def words(self) -> str:
@@ -117,7 +118,7 @@ def tiling_of(model: ModelProto, where: str = "") -> Tiling:
                 f"is fixed to {fixed_px} pixels"
             )
         # A tile begins and ends on the lattice, so its context does too.
-        halo_px = -(-radius_px // alignment_px) * alignment_px
+        halo_px = up_to_multiple(radius_px, alignment_px)
         min_side_px = max(rows.min_side_px, columns.min_side_px)
         return Tiling(
             halo_px, alignment_px, rows.scale, channels_in, channels_out, fixed_px, min_side_px

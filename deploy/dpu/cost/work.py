@@ -9,6 +9,7 @@ from itertools import chain
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.finding import groups_of
 from beers_deploy.dpu.graph import Operation, Shape
+from beers_deploy.profiles.rounding import up_to_multiple
 
 FUSED = ("activation", "quantize", "dequantize", "pixel shuffle")
 """Kinds that cost no time: they are computed while the operation before writes its results, and a
@@ -138,9 +139,9 @@ def _array_operations(op: Operation, dpu: Dpu) -> int:
     together = min(max(AUGMENTATION * dpu.input_parallel // read, 1), columns)
     full, rest = divmod(columns, together)
     lanes = dpu.input_parallel * dpu.whole("array", "input_groups")
-    row_inputs = full * _up(together * read, lanes) + _up(rest * read, lanes)
+    row_inputs = full * up_to_multiple(together * read, lanes) + up_to_multiple(rest * read, lanes)
     inputs = math.prod(strides) * rows * row_inputs
-    return 2 * inputs * _up(channels, dpu.output_parallel) * pixels
+    return 2 * inputs * up_to_multiple(channels, dpu.output_parallel) * pixels
 
 
 def _lane_steps(op: Operation, dpu: Dpu) -> int:
@@ -149,7 +150,7 @@ def _lane_steps(op: Operation, dpu: Dpu) -> int:
     # A depthwise convolution with several results a channel passes over its map for each of them.
     passes = max(op.channels[1] // max(op.channels[0], 1), 1) if op.kind == "depthwise" else 1
     taps = op.kernel_area * passes
-    channels = _up(op.in_shape[0], dpu.whole("elementwise", "channels_per_cycle"))
+    channels = up_to_multiple(op.in_shape[0], dpu.whole("elementwise", "channels_per_cycle"))
     rows = min(dpu.whole("elementwise", "pixels_per_cycle"), dpu.whole("array", "pixel_parallel"))
     return taps * channels * _positions(op.out_shape, rows)
 
@@ -158,11 +159,7 @@ def _positions(shape: Shape | None, rows: int, columns: int = 1) -> int:
     """Return the number of output pixels, rounded up to the rows and columns that are computed at
     once.
     """
-    return _up(shape[1], rows) * _up(shape[2], columns) if shape else 0
-
-
-def _up(count: int, size: int) -> int:
-    return groups_of(count, size) * size
+    return up_to_multiple(shape[1], rows) * up_to_multiple(shape[2], columns) if shape else 0
 
 
 class _Flow:
@@ -257,7 +254,7 @@ class _Flow:
         size = _size(op.out_shape)
         piece = self._pieces.get(name)
         # Pieces lie apart in memory: each takes whole bursts.
-        return size // piece * _up(piece, BURST_BYTES) if piece else size
+        return size // piece * up_to_multiple(piece, BURST_BYTES) if piece else size
 
     def _fused(self, add: Operation) -> str:
         """Return the operand of an add that is computed last."""
@@ -270,7 +267,10 @@ class _Flow:
     def _fits(self, root: str) -> bool:
         shape = self._shapes.get(root)
         # In the banks, channels are filled up to the number of lanes.
-        return shape is None or _up(shape[0], self._lanes) * shape[1] * shape[2] <= self._bank_bytes
+        return (
+            shape is None
+            or up_to_multiple(shape[0], self._lanes) * shape[1] * shape[2] <= self._bank_bytes
+        )
 
     def _root(self, name: str) -> str:
         return self._same.get(name, name)

@@ -12,6 +12,7 @@ from beers_deploy.performance.swath import Swath
 from beers_deploy.performance.timing import interleaved
 from beers_deploy.performance.traditional import drawn_acquisition
 from beers_deploy.profiles.figures import Figure, measured
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import sensor_names
 from beers_deploy.quant.quantize import quantize_model
@@ -183,7 +184,7 @@ def tiles_of_point(point: Point, shape: tuple[int, ...]) -> Plan:
     tiling = network_of_variant(point.variant).tiling
     halo_px = tiling.halo_px if point.halo_px is None else point.halo_px
     # Half of the shorter side, rounded up to the halo's step: an image in one tile has no seam.
-    half_px = HALO_STEP_PX * -(-(min(shape) // 2) // HALO_STEP_PX) + 2 * halo_px
+    half_px = up_to_multiple(min(shape) // 2, HALO_STEP_PX) + 2 * halo_px
     return make_plan((1, *shape), min(point.tile_px, half_px), halo_px, tiling)
 
 
