@@ -4,6 +4,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jinja2
 from markupsafe import Markup, escape
@@ -69,6 +70,38 @@ class Section:
     rows: Sequence[Row]
     caption: str = ""
 
+    def grid(self, sorts: bool) -> dict[str, Any]:
+        """Return the table as the template shows it: heading, columns, lines and notes.
+
+        Args:
+            sorts: True if a click on a heading sorts the table. Its rows are then never turned into
+                columns.
+        """
+        rows = list(self.rows)
+        figures = columns_of(rows)
+        words = words_of(rows)
+        columns = [_head(column.name, column.unit) for column in figures]
+        columns += [_head(word, word=True) for word in words]
+        cells = []
+        for row in rows:
+            texts = [row.text.get(word, "") for word in words]
+            line = [_cell(row.figures.get(column.name)) for column in figures]
+            line += [{"text": text, "mode": "word", "title": "", "value": text} for text in texts]
+            cells.append(line)
+        sides = [columns, [_head(row.name) for row in rows]]
+        if not sorts and len(columns) > max(WIDE, len(rows)):
+            # Columns that do not fit on a page are turned into rows, because a page is open
+            # downwards.
+            sides.reverse()
+            cells = [list(line) for line in zip(*cells, strict=True)]
+        return {
+            "title": self.title,
+            "caption": self.caption,
+            "header": sides[0],
+            "lines": list(zip(sides[1], cells, strict=True)),
+            "missing": missing(rows),
+        }
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -109,33 +142,7 @@ class Report:
 
 def render(report: Report) -> str:
     """Render a report as the text of one HTML file, with its pictures embedded."""
-    tables = []
-    for table in report.tables:
-        rows = list(table.rows)
-        figures = columns_of(rows)
-        words = words_of(rows)
-        columns = [_head(column.name, column.unit) for column in figures]
-        columns += [_head(word, word=True) for word in words]
-        cells = []
-        for row in rows:
-            texts = [row.text.get(word, "") for word in words]
-            line = [_cell(row.figures.get(column.name)) for column in figures]
-            line += [{"text": text, "mode": "word", "title": "", "value": text} for text in texts]
-            cells.append(line)
-        sides = [columns, [_head(row.name) for row in rows]]
-        if not report.sorts and len(columns) > max(WIDE, len(rows)):
-            # Columns that do not fit on a page are turned into rows, because a page is open
-            # downwards.
-            sides.reverse()
-            cells = [list(line) for line in zip(*cells, strict=True)]
-        grid = {
-            "title": table.title,
-            "caption": table.caption,
-            "header": sides[0],
-            "lines": list(zip(sides[1], cells, strict=True)),
-            "missing": missing(rows),
-        }
-        tables.append(grid)
+    tables = [table.grid(report.sorts) for table in report.tables]
     return template("report.html").render(report=report, tables=tables, version=__version__)
 
 

@@ -333,22 +333,22 @@ def _of_our_opset(model: ModelProto) -> ModelProto:
         converted = version_converter.convert_version(model, OPSET)
     except (InferenceError, RuntimeError, ValueError):
         return model
-    for node in converted.graph.node:
-        # Enlargements of older opsets start at the corner. The converter leaves the default, which
-        # is shifted by half a pixel.
-        if node.op_type == "Resize" and version < RESIZE_HAS_MODES:
-            modes = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
-            attributes = [a for a in node.attribute if a.name not in modes]
-            attributes += [helper.make_attribute(*mode) for mode in modes.items()]
-            replace_all(node.attribute, attributes)
-        # The converter leaves attributes that the operator of our opset lacks. onnxruntime has
-        # written their defaults.
-        if version > OPSET:
-            newer, ours = (defs.get_schema(node.op_type, v).attributes for v in (version, OPSET))
-            replace_all(
-                node.attribute,
-                [a for a in node.attribute if a.name in ours or a != newer[a.name].default_value],
-            )
+    # Enlargements of older opsets start at the corner. The converter leaves the default, which is
+    # shifted by half a pixel.
+    modes = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+    resizes = (node for node in converted.graph.node if node.op_type == "Resize")
+    for node in resizes if version < RESIZE_HAS_MODES else ():
+        attributes = [a for a in node.attribute if a.name not in modes]
+        attributes += [helper.make_attribute(*mode) for mode in modes.items()]
+        replace_all(node.attribute, attributes)
+    # The converter leaves attributes that the operator of our opset lacks. onnxruntime has written
+    # their defaults.
+    for node in converted.graph.node if version > OPSET else ():
+        newer, ours = (defs.get_schema(node.op_type, v).attributes for v in (version, OPSET))
+        attributes = [
+            a for a in node.attribute if a.name in ours or a != newer[a.name].default_value
+        ]
+        replace_all(node.attribute, attributes)
     return converted
 
 
