@@ -287,12 +287,12 @@ class OfOneSensor(nn.Module):
         return restored
 
 
-Network = ConvBEERS | BankedConvBEERS
+TrainableNetwork = ConvBEERS | BankedConvBEERS
 """A network that can be trained and saved: a plain one, or one for every sensor in range."""
 
 
 def for_sensor(
-    network: Network, vector: Tensor, bank: Bank | None = None
+    network: TrainableNetwork, vector: Tensor, bank: Bank | None = None
 ) -> ConvBEERS | OfOneSensor:
     """Return a network that accepts images only.
 
@@ -309,7 +309,7 @@ def for_sensor(
     return OfOneSensor(network, Condition.of(vector[None], [bank]))
 
 
-def initialise(network: Network, generator: torch.Generator) -> None:
+def initialise(network: TrainableNetwork, generator: torch.Generator) -> None:
     """Draw the first weights of a network, so that it changes images hardly at all.
 
     Weights are He-normal. The last convolution of each residual branch and the tail are scaled
@@ -342,12 +342,12 @@ def arrays(tensors: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
     return {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()}
 
 
-def network_of(weights: Weights) -> Network:
+def network_of(weights: Weights) -> TrainableNetwork:
     """Build the torch network that has the given weights, in evaluation mode on the CPU.
 
     It is a `ConvBEERS` for weights of a plain network, else a `BankedConvBEERS`.
     """
-    network: Network = ConvBEERS(weights.variant)
+    network: TrainableNetwork = ConvBEERS(weights.variant)
     if weights.conditioned:
         network = BankedConvBEERS(weights.variant, weights.kernels)
     network.load_state_dict(
@@ -356,7 +356,7 @@ def network_of(weights: Weights) -> Network:
     return network.eval()
 
 
-def save_network(path: Path, network: Network, recipe: Mapping[str, object]) -> None:
+def save_network(path: Path, network: TrainableNetwork, recipe: Mapping[str, object]) -> None:
     """Write a network's weights, its variant and the recipe that made them; for a network behind a
     bank also its sensor ranges. `read_weights` reads them.
     """
@@ -367,7 +367,7 @@ def save_network(path: Path, network: Network, recipe: Mapping[str, object]) -> 
     write_tensors(path, arrays(network.state_dict()), header)
 
 
-def load_network(path: Path) -> tuple[Network, dict[str, object]]:
+def load_network(path: Path) -> tuple[TrainableNetwork, dict[str, object]]:
     """Read a network in evaluation mode, plain or behind a bank, and its recipe."""
     weights = read_weights(path)
     return network_of(weights), weights.recipe

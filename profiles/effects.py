@@ -358,7 +358,7 @@ def effect_tables(label: str, raw: Mapping[str, object]) -> dict[str, object]:
     return tables
 
 
-Table = Mapping[str, Constant]
+EffectTable = Mapping[str, Constant]
 """The parameters of an effect as a file states them, each a number or a range."""
 
 
@@ -373,15 +373,17 @@ for _name, _effect in TABLES.items():
 AnyEffects = create_model("Effects", __config__=CONFIG, **_OPTIONAL)
 
 
-def _read_effects(raw: object) -> dict[str, Table]:
+def _read_effects(raw: object) -> dict[str, EffectTable]:
     return {name: table for name, table in AnyEffects.model_validate(raw) if table is not None}
 
 
-Effects = Annotated[Mapping[str, Table], PlainValidator(_read_effects)]
+Effects = Annotated[Mapping[str, EffectTable], PlainValidator(_read_effects)]
 """The tables of some effects by name, in the order of `TABLES`."""
 
 
-def settled(tables: Mapping[str, Table], number: Callable[[Constant], float]) -> dict[str, Effect]:
+def settled(
+    tables: Mapping[str, EffectTable], number: Callable[[Constant], float]
+) -> dict[str, Effect]:
     """Return effects by name, made from tables whose parameters may be ranges.
 
     Args:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from beers_deploy.profiles.effects import Dsnu, Effect, Prnu, Striping, Table
+from beers_deploy.profiles.effects import Dsnu, Effect, EffectTable, Prnu, Striping
 from beers_deploy.profiles.response import PointSpread, Response
 
 MAX_DN = 4095
@@ -24,7 +24,7 @@ ROUNDING = 1e-14
 the two variances.
 """
 
-E = TypeVar("E", Effect, Table)
+E = TypeVar("E", Effect, EffectTable)
 
 
 @dataclass(frozen=True)

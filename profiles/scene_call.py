@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from beers_deploy.profiles.constant import Constant, Limits
-from beers_deploy.profiles.effects import TABLES, AnyEffects, Effects, Table, effect_tables
+from beers_deploy.profiles.effects import TABLES, AnyEffects, Effects, EffectTable, effect_tables
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import HERE
@@ -66,7 +66,7 @@ class SceneCall:
         return validated(SceneCall, fields, label, {"effects": ""})
 
 
-def typical_effects() -> dict[str, Table]:
+def typical_effects() -> dict[str, EffectTable]:
     """Read the typical values of every optional effect from `profiles/effects.toml`.
 
     `simulate --with NAME` adds an effect with these values.

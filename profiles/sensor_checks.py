@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from beers_deploy.profiles.constant import Constant
-from beers_deploy.profiles.effects import Table
+from beers_deploy.profiles.effects import EffectTable
 from beers_deploy.profiles.errors import counted
 from beers_deploy.profiles.instrument import mtf_limit, snr_0_bounds
 from beers_deploy.profiles.response import MtfTable, PointSpread
@@ -66,7 +66,7 @@ def impossible_snr(radiances: Pair, snrs: Pair) -> str:
 
 
 def require_possible_blur(
-    axes: Pair, response: MtfTable | PointSpread | None, effects: Mapping[str, Table]
+    axes: Pair, response: MtfTable | PointSpread | None, effects: Mapping[str, EffectTable]
 ) -> None:
     """Raise ValueError if the response contradicts the contrasts, or if they exceed the anti-alias
     filter.

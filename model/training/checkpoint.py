@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beers_deploy.model.convbeers import Network, arrays, for_sensor, save_network
+from beers_deploy.model.convbeers import TrainableNetwork, arrays, for_sensor, save_network
 from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.tensors import all_finite, read_tensors
 from beers_deploy.model.training.losses import PAPER, LossWeights
@@ -116,7 +116,7 @@ class Guards:
 
 
 def require_finite_output(
-    network: Network, name: str, remedy: str = "Lower the learning rate."
+    network: TrainableNetwork, name: str, remedy: str = "Lower the learning rate."
 ) -> None:
     """Raise ModelError if a network returns NaN or infinity for an image in [0, 1].
 
@@ -151,7 +151,7 @@ def checkpoint_sha256(tensors: Mapping[str, Tensor], header: Mapping[str, object
 
 
 def read_checkpoint(
-    path: Path, network: Network, recipe: TrainingRecipe, data: str
+    path: Path, network: TrainableNetwork, recipe: TrainingRecipe, data: str
 ) -> tuple[dict[str, Tensor], int, Guards]:
     """Read and validate a checkpoint, or raise ModelError.
 
@@ -214,7 +214,7 @@ def _options(recipe: object) -> dict[str, object]:
     return options
 
 
-def finish(network: Network, path: Path, recipe: dict[str, object]) -> None:
+def finish(network: TrainableNetwork, path: Path, recipe: dict[str, object]) -> None:
     """Write the weights of a trained network to a file, with the recipe in its header.
 
     Raises:
@@ -228,7 +228,7 @@ def finish(network: Network, path: Path, recipe: dict[str, object]) -> None:
     save_network(path, network, recipe)
 
 
-def _check_parts(tensors: dict[str, Tensor], network: Network) -> None:
+def _check_parts(tensors: dict[str, Tensor], network: TrainableNetwork) -> None:
     """Raise ValueError unless all tensors fit the network and Adam: nothing is filled in before."""
     templates: dict[str, Tensor] = {}
     for key, value in network.state_dict().items():

@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from beers_deploy.model.bank import in_places
-from beers_deploy.model.convbeers import BankedConvBEERS, Network, initialise
+from beers_deploy.model.convbeers import BankedConvBEERS, TrainableNetwork, initialise
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError
 
-N = TypeVar("N", bound=Network)
+N = TypeVar("N", bound=TrainableNetwork)
 
 
 def grow(network: N, variant: Variant, generator: torch.Generator) -> N:

@@ -19,8 +19,8 @@ import torch
 from beers_deploy.model.convbeers import (
     BankedConvBEERS,
     ConvBEERS,
-    Network,
     Rounding,
+    TrainableNetwork,
     load_network,
 )
 from beers_deploy.model.io.files import sha256
@@ -146,7 +146,7 @@ def train(run: Run, resume: bool, worker: Worker) -> None:
         finish(trainer.averaged(), run.weights, recipe)
 
 
-def _given(run: Run, path: Path) -> Network:
+def _given(run: Run, path: Path) -> TrainableNetwork:
     """Load a network of the kind that the run trains, or raise an error if it does not fit.
 
     A network that returns NaN is rejected too, because it would in every step.
@@ -289,7 +289,7 @@ def _train(run: Run, trainer: Trainer, batches: Batches, validation: Validation)
             rate = f"{patches_per_s:.0f} patches/s in {run.precision}, waits {waited:.0%}"
             bar.advance(step - bar.done, f"{means}, {rate}")
 
-        def validate(step: int, network: Network) -> None:
+        def validate(step: int, network: TrainableNetwork) -> None:
             require_finite_output(network, f"The network at training step {step}")
             restored = validation.restore(network)
             scores.write(step, validation.judge(restored))

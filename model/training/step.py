@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 
-from beers_deploy.model.convbeers import Condition, Network, Rounding
+from beers_deploy.model.convbeers import Condition, Rounding, TrainableNetwork
 from beers_deploy.model.training.losses import RestorationLoss
 from beers_deploy.model.training.source import Batch
 
@@ -68,7 +68,7 @@ class Step:
 
     def __init__(
         self,
-        network: Network,
+        network: TrainableNetwork,
         loss: RestorationLoss,
         forward: nn.Module,
         gradient_norm: float,

@@ -21,8 +21,8 @@ from torch.nn.parallel import DistributedDataParallel
 from beers_deploy.model.convbeers import (
     BankedConvBEERS,
     ConvBEERS,
-    Network,
     Rounding,
+    TrainableNetwork,
     arrays,
     initialise,
 )
@@ -131,7 +131,7 @@ class Schedule:
     report: Callable[[int, Mapping[str, float], float, float], None] = field(
         default=lambda *_: None
     )
-    validate: Callable[[int, Network], None] = field(default=lambda *_: None)
+    validate: Callable[[int, TrainableNetwork], None] = field(default=lambda *_: None)
 
 
 def largest_of_all(flag: Tensor) -> Tensor:
@@ -167,7 +167,7 @@ class Trainer:
         loss: RestorationLoss | None = None,
         worker: Worker | None = None,
         device: str = "cpu",
-        start: Network | None = None,
+        start: TrainableNetwork | None = None,
         precision: Precision = "float32",
         conditioned: bool = False,
         rounding: Rounding | None = None,
@@ -187,7 +187,7 @@ class Trainer:
         self.step = 0
         self.guards = Guards()
         self.data = ""
-        self.network: Network = (BankedConvBEERS if conditioned else ConvBEERS)(variant)
+        self.network: TrainableNetwork = (BankedConvBEERS if conditioned else ConvBEERS)(variant)
         initialise(self.network, torch.Generator().manual_seed(recipe.seed))
         if start is not None:
             self.network.load_state_dict(start.state_dict())
@@ -286,7 +286,7 @@ class Trainer:
                 self.guards.passed(number, total)
         return rows
 
-    def averaged(self) -> Network:
+    def averaged(self) -> TrainableNetwork:
         """Return the network with its running-average weights on the CPU: the one that is
         shipped.
         """

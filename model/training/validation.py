@@ -10,7 +10,7 @@ from torch.nn.functional import pad
 
 from beers_deploy.model.bank import network_bank
 from beers_deploy.model.convbeers import (
-    Network,
+    TrainableNetwork,
     for_sensor,
     vector_tensor,
 )
@@ -102,7 +102,7 @@ class Validation:
             self.pairs.append((degraded_image, reference_image))
             self.sensors.append(sensors[0])
 
-    def restore(self, network: Network) -> list[np.ndarray]:
+    def restore(self, network: TrainableNetwork) -> list[np.ndarray]:
         """Restore each degraded image with the network in float32, (H, W), clipped to [0, 1].
 
         A conditioned network is given the sensor that acquired the image. An image whose sides are

@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 
 from beers_deploy.model.convbeers import (
     BankedConvBEERS,
-    Network,
+    TrainableNetwork,
     arrays,
     load_network,
     save_network,
@@ -38,7 +38,7 @@ def conditioned() -> BankedConvBEERS:
 @pytest.mark.parametrize(
     "network", [*(plain(Variant(*size)) for size in ((0, 1), (1, 4, 2), (3, 5))), conditioned()]
 )
-def test_a_saved_network_is_loaded_unchanged(network: Network, tmp_path: Path) -> None:
+def test_a_saved_network_is_loaded_unchanged(network: TrainableNetwork, tmp_path: Path) -> None:
     path = tmp_path / "made" / "w.safetensors"
     save_network(path, network, {"loss": "L1", "steps": 7})
     loaded, recipe = load_network(path)
