@@ -195,7 +195,7 @@ class SelfCheck:
         spectrum = np.fft.rfft2(wide) * np.fft.rfft2(kernel, wide.shape)
         blurred = np.fft.irfft2(spectrum, wide.shape)[2 * REACH_PX :, 2 * REACH_PX :]
 
-        inside = down.kept, across.kept
+        inside = down.keep_slice, across.keep_slice
         excluded = missing | (raw >= self.full_scale)
         if excluded.any():
             excluded = maximum_filter(excluded, 2 * NEAR_PX + 1, mode="constant")

@@ -63,7 +63,7 @@ class Placed:
         return min(max(first, low), high), max(min(last, high), low)
 
     @property
-    def kept(self) -> slice:
+    def keep_slice(self) -> slice:
         """The pixels of the result in the array."""
         return slice(self.keep_start - self.start, self.keep_stop - self.start)
 

@@ -242,8 +242,8 @@ class Consistency:
             # Next to an excluded block, the finer residual is no noise, and may be NaN.
             change += np.where(share == 1, fine, np.float32(0))
         if smooth is not restored:
-            kept = down.kept, across.kept
-            change += np.where(missing, np.float32(0), smooth - restored)[kept]
+            window = down.keep_slice, across.keep_slice
+            change += np.where(missing, np.float32(0), smooth - restored)[window]
         return change
 
     def _far(
