@@ -1,4 +1,4 @@
-"""Read NumPy files from untrusted sources, without unpickling, and tensors of torch.
+"""Read NumPy files from untrusted sources, without unpickling, and tensors of torch; size arrays.
 
 Any damage of a file is reported as one reason.
 """
@@ -73,3 +73,8 @@ def array_of(tensor: Any, name: str) -> np.ndarray:
             f"`{name}` has a tensor that NumPy does not read: {reason_of(error)}. Convert it, for "
             "example with .float() or .to_dense()."
         ) from error
+
+
+def up_to_multiple(count: int, size: int) -> int:
+    """Return the smallest multiple of `size` that is not below `count`."""
+    return -(-count // size) * size

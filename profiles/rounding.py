@@ -1,6 +1,0 @@
-"""Round integers to multiples."""
-
-
-def up_to_multiple(count: int, size: int) -> int:
-    """Return the smallest multiple of `size` that is not below `count`."""
-    return -(-count // size) * size
