@@ -18,7 +18,7 @@ from beers_deploy.network_files import int8_for_sensor, warn_outside
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.profiles.user_files import unreadable
+from beers_deploy.profiles.user_files.whole import unreadable
 from beers_deploy.quant.c_code import c_program
 from beers_deploy.quant.encodings import (
     host_model,

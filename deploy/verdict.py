@@ -31,8 +31,8 @@ from beers_deploy.dpu.reading import sized_graph, usual_tile_px
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import OptionError, encodable, printable, reason_of
 from beers_deploy.profiles.figures import Check
-from beers_deploy.profiles.json_text import read_json
 from beers_deploy.profiles.target import TargetProfile
+from beers_deploy.profiles.user_files.json_text import read_json
 from beers_deploy.quant.encodings import as_on_board
 from beers_deploy.quant.float_parts import float_note
 from beers_deploy.quant.gate import unfit_reference

@@ -36,8 +36,8 @@ from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene, read_scene, resample
 from beers_deploy.profiles.errors import ImageError, MachineError, OptionError
 from beers_deploy.profiles.instrument import Instrument
-from beers_deploy.profiles.json_text import parse_json
 from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.user_files.json_text import parse_json
 
 logger = logging.getLogger(__name__)
 

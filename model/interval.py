@@ -29,8 +29,8 @@ from beers_deploy.model.levels import LEVELS, Level
 from beers_deploy.model.simulator.mtf import mtf, sensor_mtf
 from beers_deploy.profiles.errors import ModelError, OptionError, printable, reason_of
 from beers_deploy.profiles.instrument import Instrument, PixelNoise, pixel_noise
-from beers_deploy.profiles.json_text import parse_json
 from beers_deploy.profiles.response import NYQUIST, Array
+from beers_deploy.profiles.user_files.json_text import parse_json
 
 CONTEXT_PX = 1
 """Rows and columns around a pixel that its half-width depends on."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from beers_deploy.model.io.files import sha256
-from beers_deploy.profiles.json_text import parse_json
+from beers_deploy.profiles.user_files.json_text import parse_json
 
 Line = dict[str, object]
 """A line of the manifest, which describes one pair."""

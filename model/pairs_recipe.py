@@ -7,9 +7,9 @@ from typing import Any
 from beers_deploy.model.raster.images import site_of
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.json_text import read_json
 from beers_deploy.profiles.reference import reference_for
 from beers_deploy.profiles.sensor import Sensor, SensorLike, same_instrument
+from beers_deploy.profiles.user_files.json_text import read_json
 from beers_deploy.profiles.validation import validated
 
 

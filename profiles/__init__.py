@@ -10,6 +10,7 @@ NumPy.
   table or a point-spread function; `point_spread_file`: a point-spread function as a .npy file;
 - `target`: processing boards, in `targets/`; `target_limits`: the valid numbers of a board;
 - `constant`: a number with its limits, status and source; `validation`: pydantic's errors in one
-  sentence; `toml`: reading of files; `shipped`: the names of the shipped profiles;
+  sentence; `toml`: reading of a profile, `user_files` of other files; `shipped`: the names of the
+  shipped profiles; `rounding`: whole numbers;
 - `figures`: numbers with unit, mode and source; `errors`: the exceptions for bad input.
 """

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 from pydantic.dataclasses import dataclass
 
-from beers_deploy.profiles.arrays import ALONE, load_arrays
 from beers_deploy.profiles.errors import ProfileError, printable
 from beers_deploy.profiles.response import (
     KEPT_SIDE,
@@ -16,6 +15,7 @@ from beers_deploy.profiles.response import (
     centroid,
     packed,
 )
+from beers_deploy.profiles.user_files.arrays import ALONE, load_arrays
 from beers_deploy.profiles.validation import CONFIG, validated
 
 FILE_SIDE = 4096

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from beers_deploy.profiles.errors import ProfileError, printable
 from beers_deploy.profiles.shipped import profile_path, shipped_names
-from beers_deploy.profiles.user_files import QUOTED, TOO_DEEP, read_whole
+from beers_deploy.profiles.user_files.whole import QUOTED, TOO_DEEP, read_whole
 
 TOML_BYTES = 1 << 16
 """The maximum size of a file, five times the largest shipped profile."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.figures import Check
 from beers_deploy.profiles.toml import read_toml_text
-from beers_deploy.profiles.user_files import unreadable
+from beers_deploy.profiles.user_files.whole import unreadable
 
 if TYPE_CHECKING:
     # `bd.Limits` must not load a runtime.

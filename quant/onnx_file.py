@@ -34,7 +34,7 @@ from beers_deploy.profiles.errors import (
     printable,
     reason_of,
 )
-from beers_deploy.profiles.user_files import read_whole, unreadable
+from beers_deploy.profiles.user_files.whole import read_whole, unreadable
 from beers_deploy.quant.domains import IR_VERSION, MICROSOFT, OPSET, STANDARD, opset_of
 from beers_deploy.quant.onnx.external_weights import take_in
 from beers_deploy.quant.onnx.graph import OnnxGraph

@@ -17,9 +17,9 @@ from itertools import chain
 import numpy as np
 from onnx import ModelProto, helper
 
-from beers_deploy.profiles.arrays import up_to_multiple
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.figures import Check
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.quant.adapt.kinds import Kind, nodes_by_kind
 from beers_deploy.quant.bounds import within_int8
 from beers_deploy.quant.core import IntConv, IntCore

@@ -17,8 +17,8 @@ import onnx
 
 from beers_deploy.dpu.graph import Kind, Operation, Shape, SizedGraph, kind_of, out_shape
 from beers_deploy.model.bank import GAINS, LARGEST, WIDE
-from beers_deploy.profiles.arrays import up_to_multiple
 from beers_deploy.profiles.errors import ModelError, printable
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.quant.encodings import BORDER_PX, PLACE_PX, as_on_board
 from beers_deploy.quant.graph.pixel_shuffle import with_shuffles

@@ -20,13 +20,14 @@ from beers_deploy import __version__
 from beers_deploy.dpu.board import BoardLike, device_of
 from beers_deploy.model.io.files import whole_file, write_text
 from beers_deploy.network import Network, NetworkLike
-from beers_deploy.profiles.arrays import ALONE, load_arrays, up_to_multiple
 from beers_deploy.profiles.errors import ImageError, OptionError, printable
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.json_text import read_json
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.profiles.shipped import DEFAULT_TARGET
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.profiles.user_files import unreadable
+from beers_deploy.profiles.user_files.arrays import ALONE, load_arrays
+from beers_deploy.profiles.user_files.json_text import read_json
+from beers_deploy.profiles.user_files.whole import unreadable
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import read_core, require_undamaged
 from beers_deploy.quant.graph import PLANES

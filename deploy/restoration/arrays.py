@@ -21,8 +21,8 @@ from beers_deploy.model.raster.facts import (
     usable_nodata,
 )
 from beers_deploy.model.raster.source import ArraySource
-from beers_deploy.profiles.arrays import array_of
 from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.user_files.arrays import array_of
 from beers_deploy.restoration.interval import HalfWidths, half_widths_of
 from beers_deploy.restoration.prepare import NetworkPipeline, Pipeline
 from beers_deploy.restoration.radiometry import Reading

@@ -23,7 +23,7 @@ from beers_deploy.model.io.files import require_regular
 from beers_deploy.model.io.lock import part_folder
 from beers_deploy.model.raster.writer import padded_px
 from beers_deploy.profiles.errors import MachineError, OptionError, sizes
-from beers_deploy.profiles.json_text import read_json
+from beers_deploy.profiles.user_files.json_text import read_json
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.tiles.rows import RestoredRow
 

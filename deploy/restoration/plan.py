@@ -12,9 +12,9 @@ from itertools import product
 from typing import NamedTuple
 
 from beers_deploy.network import Network
-from beers_deploy.profiles.arrays import up_to_multiple
 from beers_deploy.profiles.errors import ModelError, OptionError, counted, printable
 from beers_deploy.profiles.figures import Figure, predicted
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.quant.tiling.receptive_field import Tiling
 

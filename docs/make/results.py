@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from beers_deploy.profiles.json_text import read_json
+from beers_deploy.profiles.user_files.json_text import read_json
 
 PAGES = Path(__file__).parents[1] / "results"
 MARKED = re.compile(r"(<!-- (?P<name>[^>]+?) -->\n)(?P<table>.*?)(<!-- end -->\n)", re.DOTALL)

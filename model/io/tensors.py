@@ -22,8 +22,8 @@ from beers_deploy.model.io.formats import HEAD_BYTES, SAFETENSORS, other_format
 from beers_deploy.model.levels import INTERVAL
 from beers_deploy.model.variants import Kernels, Variant
 from beers_deploy.profiles.errors import ModelError, printable, reason_of
-from beers_deploy.profiles.json_text import parse_json
-from beers_deploy.profiles.user_files import unreadable
+from beers_deploy.profiles.user_files.json_text import parse_json
+from beers_deploy.profiles.user_files.whole import unreadable
 
 BANKED = "behind the bank of its sensor"
 """The kind, in the header, of weights that need a sensor to form a network; plain weights state

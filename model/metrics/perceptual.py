@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from beers_deploy.profiles.errors import ImageError, ModelError, reason_of
-from beers_deploy.profiles.user_files import unreadable
+from beers_deploy.profiles.user_files.whole import unreadable
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from beers_deploy.profiles.errors import ImageError, printable
-from beers_deploy.profiles.user_files import read_whole
+from beers_deploy.profiles.user_files.whole import read_whole
 
 INDEX_SUFFIXES = {".vrt", ".xml"}
 INDEX_BYTES = 1 << 23

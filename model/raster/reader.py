@@ -33,7 +33,7 @@ from beers_deploy.profiles.errors import (
     printable,
     sizes,
 )
-from beers_deploy.profiles.user_files import unreadable
+from beers_deploy.profiles.user_files.whole import unreadable
 
 HFA = b"EHFA_HEADER_TAG"
 """The first bytes of a file of ERDAS Imagine (HFA)."""

@@ -24,8 +24,8 @@ from beers_deploy.model.raster.compression import Compression
 from beers_deploy.model.raster.facts import RESTORED, BandInfo, Raster
 from beers_deploy.model.raster.reader import LEAST_CACHE_BYTES, OFFLINE, gdal
 from beers_deploy.model.raster.source import strips
-from beers_deploy.profiles.arrays import up_to_multiple
 from beers_deploy.profiles.errors import CODE_FAULTS, OptionError
+from beers_deploy.profiles.rounding import up_to_multiple
 
 RGB = [ColorInterp.red, ColorInterp.green, ColorInterp.blue]
 TILE_PX = 256

@@ -14,9 +14,9 @@ from itertools import chain
 import numpy as np
 import onnx
 
-from beers_deploy.profiles.arrays import up_to_multiple
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.figures import Figure, Row
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.quant.adapt.compensation import compensated
 from beers_deploy.quant.adapt.inverse_deviation import fit_inverses
 from beers_deploy.quant.adapt.kinds import APPROXIMATIONS, EXACT, Kind, nodes_by_kind

@@ -8,8 +8,8 @@
 import numpy as np
 import onnx
 
-from beers_deploy.profiles.arrays import up_to_multiple
 from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Replacement
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 

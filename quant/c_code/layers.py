@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from beers_deploy.profiles.arrays import up_to_multiple
 from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.quant.core import IntConv, IntCore, op_shifts
 from beers_deploy.quant.graph import (
     Activation,

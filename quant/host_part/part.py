@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 from onnx import TensorProto
 
-from beers_deploy.profiles.arrays import up_to_multiple
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.quant.graph import (
     CORRECTION,
     IMAGE,

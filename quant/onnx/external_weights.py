@@ -16,7 +16,7 @@ from onnx import ModelProto, TensorProto
 
 from beers_deploy.model.io.files import sha256
 from beers_deploy.profiles.errors import ModelError, printable
-from beers_deploy.profiles.user_files import read_whole, unreadable
+from beers_deploy.profiles.user_files.whole import read_whole, unreadable
 from beers_deploy.quant.untrusted import FILE_BYTES, VALUE_BYTES, check_size
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from beers_deploy.profiles.figures import Row, measured
-from beers_deploy.profiles.json_text import parse_json
+from beers_deploy.profiles.user_files.json_text import parse_json
 
 KEY = "calibration_range"
 """The metadata key in an INT8 file."""

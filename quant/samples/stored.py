@@ -8,9 +8,9 @@ import numpy as np
 
 from beers_deploy.model.io.files import IMAGE_SUFFIXES
 from beers_deploy.model.raster.images import read_pixels
-from beers_deploy.profiles.arrays import array_of, load_arrays
 from beers_deploy.profiles.errors import ImageError, printable
 from beers_deploy.profiles.instrument import MAX_DN
+from beers_deploy.profiles.user_files.arrays import array_of, load_arrays
 from beers_deploy.quant.input_range import Ranges, from_shares
 from beers_deploy.quant.samples.patches import Pair
 from beers_deploy.quant.untrusted import times

@@ -28,8 +28,8 @@ from fractions import Fraction
 import numpy as np
 from onnx import ModelProto, TypeProto
 
-from beers_deploy.profiles.arrays import up_to_multiple
 from beers_deploy.profiles.errors import ModelError, counted
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.quant.graph.pixel_shuffle import MOVES, with_shuffles
 from beers_deploy.quant.onnx.elementwise import ELEMENTWISE
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph

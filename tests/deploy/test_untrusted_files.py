@@ -24,8 +24,8 @@ from beers_deploy.model.metrics.perceptual import read_tensors
 from beers_deploy.model.raster.images import read_pixels
 from beers_deploy.model.training.run import Log
 from beers_deploy.profiles.errors import BeersError, ModelError, OptionError
-from beers_deploy.profiles.json_text import read_json
 from beers_deploy.profiles.toml import read_toml_text
+from beers_deploy.profiles.user_files.json_text import read_json
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.restoration.checkpoint import Checkpoint, FinishedRow, journal_text
 from beers_deploy.restoration.outcome import Tally

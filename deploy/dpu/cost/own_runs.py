@@ -20,10 +20,10 @@ from beers_deploy.dpu.cost.latency import Prediction, predict
 from beers_deploy.dpu.reading import read_sized_graph
 from beers_deploy.profiles.errors import OptionError, counted, printable
 from beers_deploy.profiles.figures import Row, predicted, published
-from beers_deploy.profiles.json_text import read_json
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.profiles.user_files import unreadable
+from beers_deploy.profiles.user_files.json_text import read_json
+from beers_deploy.profiles.user_files.whole import unreadable
 from beers_deploy.profiles.validation import CONFIG
 
 EXAMPLE = 'Write [{"model": "core.onnx", "configuration": "C32B3", "tile_px": 640, "fps": 9.5}].'

@@ -9,7 +9,7 @@ from itertools import chain
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.finding import groups_of
 from beers_deploy.dpu.graph import Operation, Shape
-from beers_deploy.profiles.arrays import up_to_multiple
+from beers_deploy.profiles.rounding import up_to_multiple
 
 FUSED = ("activation", "quantize", "dequantize", "pixel shuffle")
 """Kinds that cost no time: they are computed while the operation before writes its results, and a

@@ -15,7 +15,7 @@ import numpy as np
 
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.profiles.errors import OptionError, counted
-from beers_deploy.profiles.user_files import unreadable
+from beers_deploy.profiles.user_files.whole import unreadable
 
 FOUND = "found"
 HEADER = ("column", "row", "band")

@@ -18,8 +18,8 @@ from beers_deploy.model.io.files import IMAGE_SUFFIXES
 from beers_deploy.model.raster.images import image_size_px, list_images
 from beers_deploy.model.raster.index import parse_xml
 from beers_deploy.profiles.errors import OptionError, counted, printable, reason_of
-from beers_deploy.profiles.json_text import read_json
-from beers_deploy.profiles.user_files import read_whole
+from beers_deploy.profiles.user_files.json_text import read_json
+from beers_deploy.profiles.user_files.whole import read_whole
 from beers_deploy.studies.detection.boxes import Boxes, areas
 from beers_deploy.studies.detection.detector import letters
 

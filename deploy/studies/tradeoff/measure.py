@@ -11,8 +11,8 @@ from beers_deploy.network import Network
 from beers_deploy.performance.swath import Swath
 from beers_deploy.performance.timing import interleaved
 from beers_deploy.performance.traditional import drawn_acquisition
-from beers_deploy.profiles.arrays import up_to_multiple
 from beers_deploy.profiles.figures import Figure, measured
+from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import sensor_names
 from beers_deploy.quant.quantize import quantize_model

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beers_deploy.profiles.arrays import ALONE, load_arrays
+from beers_deploy.profiles.user_files.arrays import ALONE, load_arrays
 
 ARRAYS = {"image": np.arange(40.0).reshape(4, 10), "reference": np.arange(7)}
 

@@ -1,4 +1,4 @@
-"""Read NumPy files from untrusted sources, without unpickling, and tensors of torch; size arrays.
+"""Read NumPy files from untrusted sources, without unpickling, and tensors of torch.
 
 Any damage of a file is reported as one reason.
 """
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from beers_deploy.profiles.errors import ImageError, reason_of
-from beers_deploy.profiles.user_files import unreadable
+from beers_deploy.profiles.user_files.whole import unreadable
 
 ZIP = b"PK"
 """The first bytes of a ZIP archive, which a truncated archive has too."""
@@ -73,8 +73,3 @@ def array_of(tensor: Any, name: str) -> np.ndarray:
             f"`{name}` has a tensor that NumPy does not read: {reason_of(error)}. Convert it, for "
             "example with .float() or .to_dense()."
         ) from error
-
-
-def up_to_multiple(count: int, size: int) -> int:
-    """Return the smallest multiple of `size` that is not below `count`."""
-    return -(-count // size) * size

@@ -5,7 +5,7 @@ import math
 from collections import Counter
 from pathlib import Path
 
-from beers_deploy.profiles.user_files import QUOTED, TOO_DEEP, read_whole
+from beers_deploy.profiles.user_files.whole import QUOTED, TOO_DEEP, read_whole
 
 JSON_BYTES = 1 << 26
 """The maximum size of a file."""

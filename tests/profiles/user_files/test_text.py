@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.profiles.errors import BeersError, OptionError, ProfileError, printable
-from beers_deploy.profiles.json_text import JSON_BYTES, parse_json, read_json
 from beers_deploy.profiles.scene_call import SceneCall
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.profiles.toml import TOML_BYTES, read_toml_text
-from beers_deploy.profiles.user_files import QUOTED
+from beers_deploy.profiles.user_files.json_text import JSON_BYTES, parse_json, read_json
+from beers_deploy.profiles.user_files.whole import QUOTED
 from beers_deploy.quant.limits import limits_of
 
 BAD_TOML = {
