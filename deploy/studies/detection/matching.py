@@ -108,7 +108,7 @@ def find_hits(truths: Sequence[Boxes], detected: Sequence[Boxes], classes: int) 
 
 def _annotations(images: Sequence[Boxes]) -> COCO:
     """Return the boxes of I images in COCO's form, with numbers from 1 on as `id`."""
-    rows = []
+    rows = list[dict[str, object]]()
     for number, boxes in enumerate(images):
         sizes = boxes.corners[:, 2:] - boxes.corners[:, :2]
         bboxes = np.hstack([boxes.corners[:, :2], sizes])

@@ -275,10 +275,10 @@ class Selected(nn.Module):
 @pytest.mark.parametrize("nodes", ["g = Gather<axis=2>(c, twins)", "g = Gather<axis=3>(c, twins)"])
 def test_a_chain_that_only_looks_like_an_enlargement_stays(nodes: str) -> None:
     """It repeats 8 rows as 16, or makes them of channels."""
-    sizes = {"twins": np.arange(16).reshape(2, 8) % 8, "large": [1, 1, 16, 32]}
+    twins = np.arange(16).reshape(2, 8) % 8
     ends = "float[1,4,8,8] x => float[1,1,16,32] y"
     shuffled = f"c = Conv<pads=[1,1,1,1]>(x, w) {nodes} y = Reshape(g, large)"
-    model = network_from(shuffled, ends=ends, **sizes)
+    model = network_from(shuffled, ends=ends, twins=twins, large=[1, 1, 16, 32])
     assert_same(model, simplify(model, "a.onnx"), uniform(1, 4, 8, 8))
 
 
