@@ -231,16 +231,17 @@ class Consistency:
         weights = free_blocks(raw >= self.full_scale, sides, raw_at, NEAR_PX)
         if any_missing:
             weights *= free_blocks(missing, sides, origin, NEAR_PX)
-        # The share of the weights around a pixel that lies on usable blocks.
-        share: Image | np.float32 = np.float32(1)
-        if not weights.all():
+        share: Image | None = None
+        if weights.all():
+            change = interpolate(residual, down, across)
+        else:
             share = interpolate(weights, down, across)
-        change = interpolate(residual * weights, down, across)
-        change /= np.maximum(share, np.float32(LEAST_SHARE))
+            change = interpolate(residual * weights, down, across)
+            change /= np.maximum(share, np.float32(LEAST_SHARE))
         if self.detail is not None:
             fine = self.detail.correction(raw_pixels, near_pixels, down, across)
             # Next to an excluded block, the finer residual is no noise, and may be NaN.
-            change += np.where(share == 1, fine, np.float32(0))
+            change += fine if share is None else np.where(share == 1, fine, np.float32(0))
         if smooth is not restored:
             window = down.keep_slice, across.keep_slice
             change += np.where(missing, np.float32(0), smooth - restored)[window]

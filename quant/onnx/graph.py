@@ -86,8 +86,7 @@ class Node:
             name: the name of the node; None for that of the tensor.
             attributes: the attributes of the operator.
         """
-        name = output if name is None else name
-        return cls.of(helper.make_node(op_type, inputs, [output], name, **attributes))
+        return cls.of(helper.make_node(op_type, inputs, [output], name or output, **attributes))
 
     def replaced_by(self, op_type: str, inputs: Sequence[str], **attributes: Any) -> "Node":
         """Build a node of the same name and result, with another operator or other inputs.

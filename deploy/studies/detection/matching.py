@@ -46,7 +46,9 @@ class Hits:
         scores: the confidence of each detection, (D,) float64.
         hits: True if the detection found an object, (S, 10, D) bool.
         ignored: True if the detection counts neither as a hit nor as false, (S, 10, D) bool.
-        is_found: True if a detection matches the labelled box, (S, 10, M) bool.
+        label_images: the index of the image of each labelled box, (M,) int64.
+        found_at: the confidence of the detection that matches the labelled box, (S, 10, M) float64;
+            -inf if none does, and the lowest one for an ignored box.
         objects: the number of objects to find, by size, class and image, (S, C, I) int64.
     """
 
@@ -55,7 +57,8 @@ class Hits:
     scores: np.ndarray
     hits: np.ndarray
     ignored: np.ndarray
-    is_found: np.ndarray
+    label_images: np.ndarray
+    found_at: np.ndarray
     objects: np.ndarray
 
 
@@ -81,10 +84,13 @@ def find_hits(truths: Sequence[Boxes], detected: Sequence[Boxes], classes: int) 
         evaluation.params.areaRng = ranges
         evaluation.params.maxDets = [len(detections.anns)]
         evaluation.evaluate()
+    scores = np.concatenate([boxes.scores for boxes in detected])
+    # The index -1 means no detection.
+    scores_or_none = np.append(scores, -np.inf)
     levels = len(ranges), len(OVERLAPS)
     hits = np.zeros((*levels, len(detections.anns)), bool)
     ignored = np.zeros_like(hits)
-    is_found = np.zeros((*levels, len(labels.anns)), bool)
+    found_at = np.full((*levels, len(labels.anns)), -np.inf)
     objects = np.zeros((len(ranges), classes, len(truths)), np.int64)
     # There is one entry for each range, class and image with boxes.
     for entry in filter(None, evaluation.evalImgs):
@@ -93,17 +99,23 @@ def find_hits(truths: Sequence[Boxes], detected: Sequence[Boxes], classes: int) 
         of_labels = np.array(entry["gtIds"], np.int64) - 1
         hits[size][:, of_detections] = (entry["dtMatches"] > 0) & ~entry["dtIgnore"]
         ignored[size][:, of_detections] = entry["dtIgnore"]
-        is_found[size][:, of_labels] = entry["gtMatches"] > 0
+        found_at[size][:, of_labels] = scores_or_none[entry["gtMatches"].astype(np.int64) - 1]
         objects[size, entry["category_id"], entry["image_id"]] = (entry["gtIgnore"] == 0).sum()
     return Hits(
-        np.repeat(np.arange(len(detected)), [len(boxes) for boxes in detected]),
+        _image_numbers(detected),
         np.concatenate([boxes.classes for boxes in detected]),
-        np.concatenate([boxes.scores for boxes in detected]),
+        scores,
         hits,
         ignored,
-        is_found,
+        _image_numbers(truths),
+        found_at,
         objects,
     )
+
+
+def _image_numbers(images: Sequence[Boxes]) -> np.ndarray:
+    """Return the index of the image of each box, for the boxes of all images in order."""
+    return np.repeat(np.arange(len(images)), [len(boxes) for boxes in images])
 
 
 def _annotations(images: Sequence[Boxes]) -> COCO:

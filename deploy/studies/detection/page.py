@@ -10,8 +10,7 @@ from beers_deploy.model.io.pictures import grid, picture_url
 from beers_deploy.profiles.figures import by_table
 from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.results import Table
-from beers_deploy.studies.detection.boxes import Boxes
-from beers_deploy.studies.detection.matching import ALL, find_hits
+from beers_deploy.studies.detection.matching import ALL
 from beers_deploy.studies.detection.study import REFERENCE, Comparison
 from beers_deploy.studies.detection.tables import BY_SIZE, MAIN, PAPER_NOTES
 from beers_deploy.studies.evaluation.methods import DEGRADED
@@ -74,11 +73,10 @@ def crops(compared: Sequence[Comparison]) -> list[Picture]:
     A picture shows the same crop with a row for each sensor and a column for each method, and boxes
     for objects that are found, missed and false.
     """
-    losses = [
-        sum(int(_missed_objects(comparison, number).sum()) for comparison in compared)
-        for number in range(len(compared[0].scenes))
-    ]
-    numbers = np.argsort(-np.array(losses), kind="stable")[:PICTURES]
+    losses = np.zeros(len(compared[0].scenes), np.int64)
+    for comparison in compared:
+        np.add.at(losses, comparison.hits[REFERENCE].label_images[_lost_objects(comparison)], 1)
+    numbers = np.argsort(-losses, kind="stable")[:PICTURES]
     sensors = " and ".join(comparison.name for comparison in compared)
     caption = (
         f"Rows: {sensors}. {CROP_PX} pixels of the sensor a side, enlarged {ZOOM} times, one "
@@ -98,28 +96,17 @@ def crops(compared: Sequence[Comparison]) -> list[Picture]:
     return pictures
 
 
-def _missed_objects(comparison: Comparison, number: int) -> np.ndarray:
-    """Return a mask (M,) of the objects of a scene that are found on the reference and not on
+def _lost_objects(comparison: Comparison) -> np.ndarray:
+    """Return a mask (M,) of the objects of all scenes that are found on the reference and not on
     degraded images.
     """
+    truths = [acquired.scene.truth for acquired in comparison.scenes]
+    ignored = np.concatenate([truth.ignored for truth in truths])
     on_reference, on_degraded = (
-        _matched(comparison, row, number)[-1] for row in (REFERENCE, DEGRADED)
+        comparison.hits[row].found_at[ALL, 0] >= comparison.confidence
+        for row in (REFERENCE, DEGRADED)
     )
-    return np.asarray(on_reference & ~on_degraded)
-
-
-def _matched(
-    comparison: Comparison, row: str, number: int
-) -> tuple[Boxes, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the boxes on a scene that reach the table's confidence, with masks of hits, ignored
-    boxes, and matched objects at an overlap of half.
-    """
-    boxes = comparison.boxes[row][number]
-    # The pictures show what the table counts.
-    sure = boxes[boxes.scores >= comparison.confidence]
-    truth = comparison.scenes[number].scene.truth
-    hits = find_hits([truth], [sure], len(comparison.names))
-    return sure, hits.hits[ALL, 0], hits.ignored[ALL, 0], hits.is_found[ALL, 0]
+    return np.asarray(on_reference & ~on_degraded & ~ignored)
 
 
 def _middle(comparison: Comparison, number: int) -> np.ndarray:
@@ -127,7 +114,8 @@ def _middle(comparison: Comparison, number: int) -> np.ndarray:
     are considered, if there are any.
     """
     truth = comparison.scenes[number].scene.truth
-    lost_objects = _missed_objects(comparison, number)
+    of_scene = comparison.hits[REFERENCE].label_images == number
+    lost_objects = _lost_objects(comparison)[of_scene]
     corners = truth.corners[lost_objects] if lost_objects.any() else truth.corners
     if not len(corners):
         return np.zeros(2)
@@ -146,7 +134,14 @@ def _cell(comparison: Comparison, row: str, number: int, middle: np.ndarray) -> 
     scene = comparison.scenes[number]
     ratio = comparison.sensors.oversampling
     truth = scene.scene.truth
-    boxes, hits, ignored, matched = _matched(comparison, row, number)
+    hits = comparison.hits[row]
+    # The pictures show what the table counts.
+    sure = hits.scores >= comparison.confidence
+    of_scene = hits.images == number
+    is_hit = hits.hits[ALL, 0]
+    is_false = sure & ~is_hit & ~hits.ignored[ALL, 0]
+    boxes = comparison.boxes[row][number].corners
+    is_found = hits.found_at[ALL, 0, hits.label_images == number] >= comparison.confidence
     rgb = np.rint(255 * scene.shown(comparison.methods[row])).astype(np.uint8)
     most = np.maximum(np.array(rgb.shape[1::-1]) - CROP_PX, 0)
     left, top = corner = np.clip(middle / ratio - CROP_PX / 2, 0, most).astype(int).tolist()
@@ -155,9 +150,9 @@ def _cell(comparison: Comparison, row: str, number: int, middle: np.ndarray) -> 
     picture = crop.resize((CROP_PX * ZOOM, CROP_PX * ZOOM), Image.Resampling.NEAREST)
     draw = ImageDraw.Draw(picture)
     layers = (
-        (truth.corners[~matched & ~truth.ignored], MISSED),
-        (boxes.corners[~hits & ~ignored], FALSE),
-        (boxes.corners[hits], HIT),
+        (truth.corners[~is_found & ~truth.ignored], MISSED),
+        (boxes[is_false[of_scene]], FALSE),
+        (boxes[(sure & is_hit)[of_scene]], HIT),
     )
     for corners, colour in layers:
         for x1, y1, x2, y2 in (corners / ratio - np.tile(corner, 2)) * ZOOM:

@@ -25,7 +25,7 @@ from beers_deploy.studies.detection.average_precision import Figures, score_rows
 from beers_deploy.studies.detection.boxes import Boxes
 from beers_deploy.studies.detection.detector import Detector, class_numbers
 from beers_deploy.studies.detection.labels import read_labelled
-from beers_deploy.studies.detection.matching import find_hits
+from beers_deploy.studies.detection.matching import Hits, find_hits
 from beers_deploy.studies.evaluation.methods import DEGRADED, Method, method_named
 
 REFERENCE = "reference"
@@ -139,6 +139,7 @@ class Comparison:
         methods: the method of each row by its name; the reference is the first row, with None.
         scenes: the scenes as the sensors acquire them.
         boxes: for each row the detections on each scene, in scene pixels.
+        hits: for each row what its detections found.
         figures: for each row its figures by name, on all images and on each bootstrap draw.
         confidence: the confidence at which precision and recall are sampled in every row.
         names: the names of the detector's classes.
@@ -148,6 +149,7 @@ class Comparison:
     methods: Mapping[str, Method | None]
     scenes: Sequence[AcquiredScene]
     boxes: Mapping[str, Sequence[Boxes]]
+    hits: Mapping[str, Hits]
     figures: Mapping[str, Figures]
     confidence: float
     names: Sequence[str]
@@ -211,7 +213,7 @@ def run_study(
         hits = {row: find_hits(truths, row_boxes, len(names)) for row, row_boxes in boxes.items()}
         scores = score_rows(hits, names, weights)
         shown = list(acquired(scenes, pair, seed))
-        compared.append(Comparison(pair, rows, shown, boxes, *scores, names))
+        compared.append(Comparison(pair, rows, shown, boxes, hits, *scores, names))
     return compared
 
 

@@ -161,6 +161,11 @@ def test_precision_and_recall_are_those_of_what_is_left_at_a_confidence(
     pairs = drawn(np.random.default_rng(seed), 5)
     figures = scored(pairs, NAMES, confidence)
     hits = hits_of([(truth, detected[detected.scores >= confidence]) for truth, detected in pairs])
+    everything = hits_of(pairs)
+    assert_array_equal(everything.hits[..., everything.scores >= confidence], hits.hits)
+    counted = ~np.concatenate([truth.ignored for truth, _ in pairs])
+    is_found = everything.found_at[..., counted] >= confidence
+    assert_array_equal(is_found, hits.found_at[..., counted] > -np.inf)
     precision = []
     recall = []
     for kind, objects in enumerate(hits.objects[0].sum(axis=1)):

@@ -117,7 +117,7 @@ def handmade(sites: int = 12, **counts: int) -> Comparison:
         row: None if row == REFERENCE else Method(row, lambda dn: dn, "known") for row in counts
     }
     return Comparison(
-        pair, methods, list(acquired(scenes, pair, 0)), boxes, figures, confidence, NAMES
+        pair, methods, list(acquired(scenes, pair, 0)), boxes, hits, figures, confidence, NAMES
     )
 
 
