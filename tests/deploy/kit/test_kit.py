@@ -83,7 +83,7 @@ def with_host_end() -> bd.Network:
     ],
 )
 def test_the_host_part_gives_the_host_files_bytes(name: str, tmp_path: Path) -> None:
-    """The host part needs only NumPy and onnxruntime, and restores an image of odd sides."""
+    """The host part restores an image of odd sides."""
     own = {"fitted kernels": behind_fitted_kernels, "host end": with_host_end}
     int8 = own[name]() if name in own else network(name)
     folder = BOARD.kit(int8, tmp_path / "kit", tile=96)
@@ -91,8 +91,8 @@ def test_the_host_part_gives_the_host_files_bytes(name: str, tmp_path: Path) -> 
     image = uniform(*shape, seed=1)
     image = 2 * image - 1 if name == NORMALISED else image
     np.save(tmp_path / "image.npy", image)
-    files = [str(tmp_path / "image.npy"), str(tmp_path / "out.npy")]
-    subprocess.run([sys.executable, "-c", BARE, "-", *files], cwd=folder, check=True)
+    host = runpy.run_path(str(folder / "host.py"))
+    host["main"](tmp_path / "image.npy", tmp_path / "out.npy", host["cores"](), learn=False)
     alignment_px = int8.tiling.alignment_px
     scale = int(int8.tiling.scale)
     wide = np.pad(image, [(0, 0), *((0, -side % alignment_px) for side in image.shape[1:])], "edge")
@@ -158,13 +158,12 @@ def kit(sensor: bd.Sensor, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return BOARD.kit(NAME, tmp_path_factory.mktemp("kit"), tile=TILE_PX, sensor=sensor)
 
 
-def by_host(folder: Path, image: np.ndarray) -> np.ndarray:
-    """Restore an image (H, W) by a kit's host.py, on a Python with NumPy and onnxruntime alone."""
-    np.save(folder / "image.npy", image[None])
-    subprocess.run(
-        [sys.executable, "-c", BARE, "-", "image.npy", "out.npy"], cwd=folder, check=True
-    )
-    return np.asarray(np.load(folder / "out.npy")[0])
+@pytest.fixture(scope="module")
+def by_host(kit: Path, image: np.ndarray) -> np.ndarray:
+    """Restore the image by the kit's host.py, on a Python with NumPy and onnxruntime alone."""
+    np.save(kit / "image.npy", image[None])
+    subprocess.run([sys.executable, "-c", BARE, "-", "image.npy", "out.npy"], cwd=kit, check=True)
+    return np.asarray(np.load(kit / "out.npy")[0])
 
 
 @pytest.mark.parametrize(
@@ -212,14 +211,13 @@ def facts(folder: Path) -> dict[str, Any]:
 
 
 def test_the_host_part_restores_as_restore_does(
-    kit: Path, sensor: bd.Sensor, image: np.ndarray
+    by_host: np.ndarray, sensor: bd.Sensor, image: np.ndarray
 ) -> None:
     """The host part runs both steps around the network, and each of them changes the image."""
     restored = partial(bd.restore, image, network=NAME, sensor=sensor, full_scale=1.0, force=True)
-    by_kit = by_host(kit, image)
-    assert_allclose(by_kit, restored(), rtol=0, atol=1e-6)
+    assert_allclose(by_host, restored(), rtol=0, atol=1e-6)
     for without in (restored(exposure=False), restored(consistency=False)):
-        assert np.abs(by_kit - without).max() > 0.001
+        assert np.abs(by_host - without).max() > 0.001
 
 
 def test_each_exposure_has_a_core_and_a_unit(kit: Path, sensor: bd.Sensor) -> None:
@@ -266,18 +264,17 @@ def test_the_host_part_chooses_factors_and_corrects_as_the_library_does(
 
 
 def test_the_host_part_judges_blocks_as_the_library_does(
-    kit: Path, sensor: bd.Sensor, image: np.ndarray
+    kit: Path, by_host: np.ndarray, sensor: bd.Sensor, image: np.ndarray
 ) -> None:
     """The kit's self-check gives the library's chi2 and sharpening of each block, and the same
     count.
 
     An engineer so sees on the board what `restore` reports on a workstation.
     """
-    by_host(kit, image)
     blocks = np.load(kit / "out-check.npy")
     check = SelfCheck.of(sensor.nominal(), sensor.reference.nominal(), full_scale=1.0)
     sides = (Placed(side, 0, 0, side) for side in image.shape)
-    expected = check.judge(image, np.load(kit / "out.npy")[0], *sides)
+    expected = check.judge(image, by_host, *sides)
     assert_allclose(blocks[0, 0], expected.chi2, rtol=1e-3)
     assert_allclose(blocks[0, 1], expected.sharpening, rtol=1e-3)
     host = runpy.run_path(str(kit / "host.py"))
