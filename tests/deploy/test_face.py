@@ -266,8 +266,6 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
         lambda _: bd.restore("raw.tif", "a.tif", nodata=0),
         "`nodata` has no effect with an image file, which states its own",
     ),
-    "no such sensor": (lambda raw: bd.restore(raw, sensor="none"), "'none'.*dior-high"),
-    "no such network": (lambda raw: bd.restore(raw, network="none"), "a shipped network"),
     "no network": (lambda _: bd.Network.load(3), r"torch.nn.Module"),  # type: ignore[arg-type]
     "a COG of an array": (
         lambda raw: bd.restore(raw, cog=True),
@@ -297,7 +295,6 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
         "INT8 network of Tiny is missing.*`int8_network`",
     ),
     "no shipped pair": (lambda _: bd.gate("convbeers-m"), "no shipped weights 'convbeers-m'"),
-    "no board": (lambda _: bd.bench(SMALL, target="none"), "'none'.*vck190"),
     "no pairs": (
         lambda raw: bd.quantize(Tiny(), samples=(raw[None, None], raw[None, None].repeat(2, 0))),
         "a reference for each",
@@ -314,7 +311,6 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
         lambda _: bd.Network.load(Tiny(), example=(1, 9, 8, 8)),
         "torch cannot export the module Tiny",
     ),
-    "no samples": (lambda raw: bd.quantize(Tiny(), samples={"image": raw}), "or a path"),
     "no swath": (lambda _: bd.bench(SMALL, size=(0, 0)), r"`size` .*\(0, 0\)"),
     "one side": (lambda _: bd.bench(SMALL, size=5), "`size` must be WIDTHxHEIGHT"),  # type: ignore[arg-type]
     "half a pixel": (

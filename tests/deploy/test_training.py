@@ -14,7 +14,6 @@ from beers_deploy.model.convbeers import for_sensor, load_network, save_network
 from beers_deploy.model.io.tensors import read_tensors
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.training import run as training
-from beers_deploy.model.training.run import Log
 from beers_deploy.model.training.source import StoredPairs
 from beers_deploy.model.variants import VARIANTS
 from tests.deploy.command_line import done, refused
@@ -306,13 +305,3 @@ def test_a_larger_network_starts_where_a_smaller_one_stopped(
     run(images, tmp_path / "again", f"--start {narrow} --learning-rate 0")
     weights = [weights_of(path) for path in (narrow, tmp_path / "again" / narrow.name)]
     assert all(torch.allclose(weights[0][name], weights[1][name]) for name in weights[0])
-
-
-def test_a_log_drops_the_lines_after_the_step_resumed_from(tmp_path: Path) -> None:
-    log = Log(tmp_path / "log.csv", 0)
-    for step in (100, 200, 300):
-        log.write(step, {"l1": step / 1000})
-    Log(tmp_path / "log.csv", 200).write(250, {"l1": 0.25})
-    assert [row["step"] for row in rows(tmp_path / "log.csv")] == ["100", "200", "250"]
-    Log(tmp_path / "log.csv", 0)
-    assert (tmp_path / "log.csv").read_text() == ""

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tifffile
 import torch
 
 from beers_deploy.model.convbeers import arrays, load_network
@@ -154,6 +153,8 @@ def test_a_log_with_strange_lines_is_continued(tmp_path: Path) -> None:
     assert lines[:2] == ["step,loss", "1,0.5"]
     assert "30,2" not in lines
     assert lines[-1] == "21,0.25"
+    Log(path, 0)
+    assert path.read_text() == ""
 
 
 POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
@@ -186,11 +187,3 @@ def test_a_byte_order_mark_is_no_part_of_a_text(tmp_path: Path) -> None:
     (tmp_path / "one.json").write_bytes(b"\xef\xbb\xbf[1]")
     assert read_toml_text(tmp_path / "limits.toml") == {"mae": 0.5}
     assert read_json(tmp_path / "one.json") == [1]
-
-
-@pytest.mark.parametrize("name", ["out.png", "out.jpg", "out", "out.tif.gz"])
-def test_no_tiff_is_written_under_another_name(name: str, tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "raw.tif", np.full((20, 20), 500, np.uint16))
-    message = refused(f"restore {tmp_path}/raw.tif {tmp_path}/{name}")
-    assert f"such as restored.tif, got {name}" in message
-    assert not (tmp_path / name).exists()

@@ -41,14 +41,6 @@ def test_a_missing_key_is_named_with_its_table(table: str, key: str, tmp_path: P
     )
 
 
-@pytest.mark.parametrize("table", TABLES)
-def test_a_missing_table_is_named(table: str, tmp_path: Path) -> None:
-    head, _, rest = SHIPPED.partition(f"[{table}]")
-    following = rest[rest.index("\n[") :] if "\n[" in rest else ""
-    message = refusal(own_sensor(tmp_path, text=head + following))
-    assert f"mine.toml has no key {table!r}" in message
-
-
 @pytest.mark.parametrize(
     "value",
     ["-1", "-0.07", "1e-200", "nan", "inf", "true", "[]", "[0.01, 0.02, 0.03]", '"7 %"', "1" * 400],

@@ -110,17 +110,10 @@ def test_a_key_of_another_device_is_refused(place: tuple[str, str], tmp_path: Pa
     assert place[0] not in message.partition("can have the keys ")[2]
 
 
-@pytest.mark.parametrize("key", ["cores", "aie_cores", "batch_handlers", "cpb"])
-@pytest.mark.parametrize("value", ["0", "-1", "2.5"])
-def test_a_count_is_an_integer_of_at_least_1(key: str, value: str, tmp_path: Path) -> None:
-    message = refusal(tmp_path, BUILD, key, value)
-    assert f"my-board.toml configurations.C32B3.{key} must be an integer of at least 1 " in message
-    assert f"it is {value}." in message
-
-
 @pytest.mark.parametrize("command", ["check --tile 64 --target", "bench --target", "profiles"])
 def test_commands_refuse_such_a_board_in_the_same_words(command: str, tmp_path: Path) -> None:
     message = refusal(tmp_path, BUILD, "cpb", "2.5")
+    assert "my-board.toml configurations.C32B3.cpb must be an integer of at least 1 " in message
     assert message in refused(*command.split(), board(tmp_path, BUILD, "cpb", "2.5"))
 
 

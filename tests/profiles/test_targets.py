@@ -72,14 +72,6 @@ def test_a_wrong_board_gets_one_sentence(
         assert word in str(caught.value)
 
 
-def test_a_misspelt_constant_does_not_silence_its_rule(tmp_path: Path) -> None:
-    text = VEK280.replace("\narea_max =", "\narea_mox =")
-    output = done("check", "--tile", "64", "--target", write_board(tmp_path, text), code=2)
-    assert "[conv]" in output
-    assert "'area_mox'" in output
-    assert output.count("\n") == 1
-
-
 def test_a_board_without_a_base_names_its_documents(tmp_path: Path) -> None:
     without = re.sub(r"\[documents].*?\n\n", "", VEK280, flags=re.DOTALL)
     with pytest.raises(ProfileError, match=r"my-board has no table \[documents\]"):
