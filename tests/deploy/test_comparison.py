@@ -10,7 +10,7 @@ import pytest
 
 import beers_deploy as bd
 from beers_deploy.comparison import Data, sensor_input
-from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.quant.samples.own import CALIBRATED_ON, digest_of
@@ -66,18 +66,3 @@ def test_the_judged_file_does_not_choose_its_samples(model: Path) -> None:
 def test_numbers_of_another_type_are_refused_in_a_sentence(name: str, value: Any) -> None:
     with pytest.raises(OptionError, match=f"`{name}` must be"):
         bd.compare("convbeers-xs", **{name: value})
-
-
-def test_samples_smaller_than_the_mirrored_border_are_refused() -> None:
-    samples = uniform(4, 1, 2, 9)
-    with pytest.raises(ImageError, match="at least 4 pixels a side, got 2 x 9"):
-        bd.compare("convbeers-xs", samples=samples)
-
-
-def test_samples_without_contrast_are_not_judged() -> None:
-    samples = np.zeros((5, 1, 32, 40), np.float32)
-    with pytest.raises(ImageError, match="contrast"):
-        bd.compare("convbeers-xs", samples=samples)
-    samples[3] = np.random.default_rng(0).random((1, 32, 40))
-    pair = "convbeers-xs", "convbeers-xs-int8"
-    assert bd.compare(*pair, samples=samples).result.patches == 1

@@ -271,20 +271,8 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
         lambda raw: bd.restore(raw, cog=True),
         "`cog` has no effect with an array",
     ),
-    "no method": (
-        lambda _: bd.restore("raw.tif", "a.tif", method="x"),  # type: ignore[arg-type]
-        "`method` must be one of 'network', 'traditional', got 'x'",
-    ),
     "8 bits": (lambda raw: bd.restore(raw.astype(np.uint8)), "full_scale"),
     "shares": (lambda raw: bd.restore(raw / 4095), "full_scale"),
-    "other channels": (
-        lambda raw: bd.quantize(Tiny(), samples=raw[None, None, :32, :32].repeat(3, 1)),
-        "1 channel",
-    ),
-    "outside the stated range": (
-        lambda raw: bd.quantize(Tiny(), samples=raw[None, None], input_range="0,1"),
-        "values of .* must be in `input_range`, 0 to 1",
-    ),
     "INT8 again": (lambda _: bd.quantize(f"{SMALL}-int8"), "an INT8 network"),
     "no INT8 network": (
         lambda _: bd.gate("float.onnx"),
@@ -305,7 +293,6 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
         lambda _: bd.quantize(bd.Network.load(SMALL)),
         "Give '.*' or its file, and `sensor`",
     ),
-    "empty": (lambda _: bd.quantize(Tiny(), samples=[]), "`samples` contains no sample"),
     "no raw image": (lambda _: bd.characterize([]), "one or several"),
     "no module's size": (
         lambda _: bd.Network.load(Tiny(), example=(1, 9, 8, 8)),

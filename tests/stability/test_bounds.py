@@ -11,19 +11,10 @@ from beers_deploy.model.shipped import SHIPPED
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.encodings import board_model, read_core
-from beers_deploy.quant.host_part import IMAGE_SLICES
 from beers_deploy.quant.integer.reference import INT32_BITS
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.studies.stress.faults import with_ops
-from tests.quant.quick import assert_within_bounds, uniform
-
-
-def test_no_image_leaves_the_integer_bounds(quantized: Quantized) -> None:
-    for seed in range(6):
-        noise = uniform(1, 1, 17, 23, seed=seed)
-        pixels = noise if seed % 2 else np.rint(noise)
-        assert_within_bounds(quantized.core, IMAGE_SLICES.encode(pixels))
 
 
 def test_an_accumulator_that_overflows_is_found(quantized: Quantized) -> None:

@@ -158,7 +158,6 @@ def test_bench_on_this_machine(tmp_path: Path) -> None:
         ("--tile 16 --halo 8", "--tile"),
         ("--image colour.tif", "one band"),
         ("--image half.tif", "floats of at most 0.5"),
-        ("--target kv261", "kv261"),
     ],
 )
 def test_bench_refuses_what_does_not_go_together(

@@ -15,8 +15,6 @@ from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Sensor
 from tests.model.simulator import stages
 
-RATIOS = list(range(1, 9))
-
 
 def scene(height: int, width: int, seed: int = 0) -> np.ndarray:
     return 20 + 100 * np.random.default_rng(seed).random((height, width), np.float32)
