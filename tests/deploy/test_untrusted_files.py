@@ -111,7 +111,7 @@ ENDS = (4, SHAPE[1])
         json.dumps({"job": JOB, "rows": 4, "valid_results": 32}),
         journal_text({"job": 1}, [stored_rows()[1]]),
         journal_text(JOB, [stored_rows(valid_results=-5)[1]]),
-        journal_text(JOB, [stored_rows(10**9 // SHAPE[2])[1]]),
+        journal_text(JOB, [replace(stored_rows()[1], rows_px=10**9 // SHAPE[2])]),
         journal_text(JOB, [replace(stored_rows()[1], rows_px=0)]),
         journal_text(JOB, [replace(stored_rows()[1], rows_px=4.0)]),  # type: ignore[arg-type]
         journal_text(JOB, [stored_rows(valid_results=1.5)[1]]),  # type: ignore[arg-type]
