@@ -12,6 +12,7 @@ import tifffile
 from PIL import Image
 from typer.core import TyperGroup
 from typer.main import get_command
+from typer.testing import CliRunner
 
 from beers_deploy import __version__
 from beers_deploy.cli.commands import COMMANDS, app
@@ -122,24 +123,11 @@ def test_the_verbose_version_lists_libraries_and_int8_kernels(options: str) -> N
 
 def test_a_name_that_the_terminal_cannot_show_ends_no_run(tmp_path: Path) -> None:
     image = acquisition(tmp_path / "\u6771\u4eac.tif", 40, 50)
-    command = [
-        sys.executable,
-        "-c",
-        "from beers_deploy.cli.commands import app; app()",
-        "restore",
-        image,
-        tmp_path / "out.tif",
-    ]
     # Pipes have this encoding on Windows.
-    environment = {**os.environ, "PYTHONIOENCODING": "cp1252"}
-    process = subprocess.run(
-        list(map(str, command)),
-        env=environment,
-        capture_output=True,
-        encoding="cp1252",
-    )
-    assert process.returncode == 0, process.stderr
-    assert "\\u6771\\u4eac" in process.stdout
+    terminal = CliRunner(charset="cp1252")
+    result = terminal.invoke(app, ["restore", str(image), str(tmp_path / "out.tif")])
+    assert result.exit_code == 0, result.stderr
+    assert "\\u6771\\u4eac" in result.stdout
     assert tifffile.imread(tmp_path / "out.tif").shape == (40, 50)
 
 
@@ -170,7 +158,7 @@ def test_profiles_show_scenes_targets_and_sensors_with_every_source() -> None:
     assert "no effect with --toml" in refused("profiles pleiades-degraded --toml --json -")
 
 
-def test_a_description_is_shown_and_not_obeyed(tmp_path: Path) -> None:
+def test_a_description_is_shown_and_not_obeyed(scenes: Path, tmp_path: Path) -> None:
     first = next(line for line in SHIPPED.splitlines() if line.startswith("description"))
     text = (
         edited((first, 'description = "a \\u001b]0;title\\u0007 \\u001b[31mred"')) + "# \x9b31m\n"
@@ -181,7 +169,7 @@ def test_a_description_is_shown_and_not_obeyed(tmp_path: Path) -> None:
         assert set("\x1b\x07\x9b").isdisjoint(output)
         assert "31m" in output
     assert "\x1b" not in refused("restore raw.tif", "\x1b[31m.png")
-    assert "\x1b" not in done(f"simulate --explain --sensor {own}")
+    assert "\x1b" not in done(f"simulate --explain --images {scenes} --sensor {own}")
 
 
 def run_with(closing: str, *words: object) -> tuple[int, str]:

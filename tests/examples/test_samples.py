@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+import tifffile
 import torch
 
 from beers_deploy.model.simulator.sampling import Scene
@@ -29,10 +30,12 @@ def test_batches_fit_the_network_and_repeat_with_the_seed(name: str, scenes: lis
 
 @pytest.mark.parametrize("name", ["espcn", "segment"])
 def test_a_file_of_samples_can_be_read(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str, scenes: list[Scene], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "samples.npz"
-    assert main([name, "--count", "5", "--out", str(out)]) == 0
+    tifffile.imwrite(tmp_path / "drawn.tif", scenes[0].radiance)
+    words = [name, "--count", "5", "--images", str(tmp_path), "--out", str(out)]
+    assert main(words) == 0
     assert "wrote" in capsys.readouterr().out
     pairs = list(read_samples(out, NETWORKS[name].inputs, None).all.pairs)
     assert len(pairs) == 5
