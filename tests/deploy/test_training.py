@@ -23,13 +23,18 @@ from tests.profiles.own_sensor import own_sensor
 SIDE = 420
 
 
+def write_photograph(path: Path, seed: int) -> None:
+    """Write a drawn scene as a camera shows it."""
+    radiance = procedural_scene(SIDE, SIDE, np.random.default_rng(seed)).radiance
+    grey = np.clip(255 * (radiance / 400) ** (1 / 2.2), 0, 255).astype(np.uint8)
+    Image.fromarray(grey).save(path)
+
+
 @pytest.fixture(scope="module")
 def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("images")
     for number, site in enumerate(("coast_1", "forest_1", "town_1")):
-        radiance = procedural_scene(SIDE, SIDE, np.random.default_rng(number)).radiance
-        grey = np.clip(255 * (radiance / 400) ** (1 / 2.2), 0, 255).astype(np.uint8)
-        Image.fromarray(grey).save(folder / f"{site}.png")
+        write_photograph(folder / f"{site}.png", number)
     return folder
 
 

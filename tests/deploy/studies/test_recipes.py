@@ -4,15 +4,13 @@ interruption, and refusals.
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from beers_deploy.model.io.tensors import read_conditioned, read_tensors
-from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.sensor_bank.conditioned import required_conditioned_core
 from tests.deploy.command_line import done, refused
+from tests.deploy.test_training import write_photograph
 
 RECIPE = """
 variant = "convbeers-half-xs"
@@ -45,10 +43,8 @@ rounding = true
 def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     paths = []
     for number, site in enumerate(("coast_1", "town_1")):
-        radiance = procedural_scene(420, 420, np.random.default_rng(number)).radiance
-        grey = np.clip(255 * (radiance / 400) ** (1 / 2.2), 0, 255).astype(np.uint8)
         paths.append(tmp_path_factory.mktemp(site))
-        Image.fromarray(grey).save(paths[-1] / f"{site}.png")
+        write_photograph(paths[-1] / f"{site}.png", number)
     return paths
 
 
