@@ -368,8 +368,9 @@ def test_the_explanation_has_each_effect_with_its_origin_and_writes_nothing(
     assert list(working_folder.iterdir()) == []
 
 
-def test_a_command_without_a_folder_to_write_is_refused(working_folder: Path) -> None:
+def test_a_command_without_an_output_or_with_no_such_input_is_refused(working_folder: Path) -> None:
     assert "--out is missing. Give it, or add --explain" in refused("simulate")
+    assert "no such file" in refused("simulate --images none --out d")
     assert list(working_folder.iterdir()) == []
 
 
