@@ -146,11 +146,11 @@ def test_no_pair_is_read_from_an_invalid_manifest(line: str, tmp_path: Path) -> 
 def test_a_log_with_strange_lines_is_continued(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     path.write_bytes(
-        "step,loss\n1,0.5\n²,1\n12abc\n30,2\n".encode() + b"\xff\xfe\n" + b"9" * 5000 + b",1\n"
+        "step,loss\n20,0.5\n²,1\n12abc\n30,2\n".encode() + b"\xff\xfe\n" + b"9" * 5000 + b",1\n"
     )
     Log(path, 20).write(21, {"loss": 0.25})
     lines = path.read_text().splitlines()
-    assert lines[:2] == ["step,loss", "1,0.5"]
+    assert lines[:2] == ["step,loss", "20,0.5"]
     assert "30,2" not in lines
     assert lines[-1] == "21,0.25"
     Log(path, 0)

@@ -105,7 +105,7 @@ def test_samples_without_contrast_are_left_out() -> None:
     textured = (ONE_CHANNEL[0, :, :20, :30], NO_REFERENCE)
     samples = read_samples([constant, textured], 1, None)
     assert samples.all.names == ["samples[1]"]
-    with pytest.raises(ImageError, match="constant"):
+    with pytest.raises(ImageError, match="constant, but samples need contrast"):
         read_samples([constant], 1, None)
 
 
