@@ -1,32 +1,52 @@
-"""Join the axis of branches with that of channels, as SKNet and MIRNet choose among branches.
+"""Join the axis of branches with that of channels, as networks stack maps.
 
-Such a block stacks the maps of its branches along an axis of its own, (N, K, C, H, W), weights each
-by a Softmax over this axis, and adds them. A DPU has four axes, and no Softmax. In (N, K C, H, W):
+SKNet and MIRNet stack the maps of their branches along an axis of its own, (N, K, C, H, W), weight
+each by a Softmax over this axis, and add them. Others average stacked maps, or take the largest. A
+DPU has four axes, and no Softmax. In (N, K C, H, W):
 
-1. A Reshape or Unsqueeze that divides the channels is not needed. Concat and Mul stay.
+1. A Reshape or Unsqueeze that adds the axis is not needed. Concat and Mul stay.
 2. The Softmax of two branches, Sigmoid(a - b) and Sigmoid(b - a), is a convolution of one pixel and
    a Sigmoid.
-3. A sum over the branches is a convolution of one pixel, and one branch is a part of the channels.
+3. A sum or mean over the branches is a convolution of one pixel, their maximum is that of halves,
+   and one branch is a part of the channels.
 
 All of it is exact.
 """
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Replacement
+from beers_deploy.quant.simplify.standard_operators import largest
 
-BRANCH_AXES = (1, -4)
+
+@dataclass(frozen=True)
+class Branches:
+    """The map of four axes that has the values of a tensor of five.
+
+    Attributes:
+        name: the name of the map.
+        axis: the axis of the tensor along which its branches lie.
+        count: the number of branches.
+        width: the number of channels of each.
+    """
+
+    name: str
+    axis: int
+    count: int
+    width: int
 
 
 class JoinBranches:
     """A pass that joins the axis of branches with that of channels; an instance is given to
     `OnnxGraph.rewrite`.
 
-    It remembers for each tensor of five axes the map of four that has the same values.
+    It remembers the map of each tensor of five axes.
     """
 
     def __init__(self) -> None:
-        self._maps: dict[str, str] = {}
+        self._maps: dict[str, Branches] = {}
 
     def __call__(self, graph: OnnxGraph, node: Node) -> Replacement:
         """Return the nodes that replace a node, or that compute the same map in front of it; None
@@ -34,53 +54,83 @@ class JoinBranches:
         """
         before = graph.shapes.get(node.source, ())
         after = graph.shapes.get(node.result, ())
-        if len(after) == 5 and node.op_type in ("Reshape", "Unsqueeze"):
-            batch, branches, channels, *sides = after
-            if branches * channels and before == (batch, branches * channels, *sides):
-                self._maps[node.result] = node.source
+        if (len(before), len(after)) == (4, 5):
+            self._start(graph, node)
             return None
-        if len(before) != 5 or node.source not in self._maps:
+        branches = self._maps.get(node.source)
+        if branches is None:
             return None
-        _, branches, channels, *_ = before
-        if len(after) != 5:
-            return self._out_of(graph, node, branches, channels)
-        nodes = self._of_branches(graph, node, branches, channels)
+        if len(after) == 4:
+            return _out_of(graph, node, branches)
+        nodes = self._of_branches(graph, node, branches)
         if not nodes:
             return None
-        self._maps[node.result] = nodes[-1].result
+        count = branches.count
+        if node.op_type == "Concat":
+            count = sum(self._maps[name].count for name in node.inputs)
+        self._maps[node.result] = replace(branches, name=nodes[-1].result, count=count)
         # The node itself is removed if nothing else reads it.
         return [*nodes, node]
 
-    def _of_branches(
-        self, graph: OnnxGraph, node: Node, branches: int, channels: int
-    ) -> list[Node]:
+    def _start(self, graph: OnnxGraph, node: Node) -> None:
+        """Remember the map that a node gives an axis of branches (1)."""
+        axes = graph.numbers(node, 1, "axes") if node.op_type == "Unsqueeze" else [1]
+        if node.op_type not in ("Reshape", "Unsqueeze") or not axes:
+            return
+        axis = axes[0] % 5
+        sizes = list(graph.shapes[node.result])
+        count = sizes.pop(axis)
+        width = sizes[1]
+        sizes[1] *= count
+        if sizes[1] and sizes == list(graph.shapes[node.source]):
+            self._maps[node.result] = Branches(node.source, axis, count, width)
+
+    def _of_branches(self, graph: OnnxGraph, node: Node, branches: Branches) -> list[Node]:
         """Return the nodes that compute what a node does, in four axes; none for another node."""
         joined = f"{node.result}.joined"
-        axis = node.attribute("axis", -1)
-        if node.op_type == "Softmax" and axis in BRANCH_AXES and branches == 2:
+        is_along = node.attribute("axis", -1) % 5 == branches.axis
+        if node.op_type == "Softmax" and is_along and branches.count == 2:
             difference = f"{node.result}.difference"
-            weight = np.kron([[1, -1], [-1, 1]], np.eye(channels))[..., None, None]
-            conv = graph.convolution(self._maps[node.source], difference, difference, weight)
+            weight = np.kron([[1, -1], [-1, 1]], np.eye(branches.width))[..., None, None]
+            conv = graph.convolution(branches.name, difference, difference, weight)
             return [conv, Node.new("Sigmoid", [difference], joined, node.name)]
+        factors = graph.value(node, 1) if node.op_type == "Mul" else None
+        if factors is not None and factors.ndim == 5:
+            # One number for each branch.
+            if factors.size != branches.count or factors.shape[branches.axis] != factors.size:
+                return []
+            scales = np.repeat(factors, branches.width).reshape(1, -1, 1, 1)
+            constant = graph.add_constant(f"{joined}.factors", scales)
+            return [Node.new("Mul", [branches.name, constant], joined, node.name)]
         if not self._maps.keys() >= {*node.inputs}:
             return []
-        maps = [self._maps[name] for name in node.inputs]
-        if node.op_type == "Concat" and axis in BRANCH_AXES:
+        parts = [self._maps[name] for name in node.inputs]
+        maps = [part.name for part in parts]
+        if len({(part.axis, part.width) for part in parts}) > 1:
+            return []
+        if node.op_type == "Concat" and is_along:
             return [Node.new("Concat", maps, joined, node.name, axis=1)]
-        are_alike = len({graph.shapes[name][:3] for name in node.inputs}) == 1
-        if node.op_type == "Mul" and are_alike:
+        if node.op_type == "Mul" and len({part.count for part in parts}) == 1:
             return [Node.new("Mul", maps, joined, node.name)]
         return []
 
-    def _out_of(self, graph: OnnxGraph, node: Node, branches: int, channels: int) -> Replacement:
-        """Return the nodes that compute a map of all branches, or of one; None for another node."""
-        source = self._maps[node.source]
-        if node.op_type == "ReduceSum" and graph.numbers(node, 1, "axes") in ([1], [-4]):
-            weight = np.tile(np.eye(channels), branches)[..., None, None]
-            return [graph.convolution(source, node.result, node.name, weight)]
-        place = graph.value(node, 1) if node.op_type == "Gather" else None
-        if place is None or place.ndim or node.attribute("axis", 0) not in BRANCH_AXES:
+
+def _out_of(graph: OnnxGraph, node: Node, branches: Branches) -> Replacement:
+    """Return the nodes that compute a map of all branches, or of one; None for another node (3)."""
+    count = branches.count
+    width = branches.width
+    reduced = [axis % 5 for axis in graph.numbers(node, 1, "axes") or ()]
+    if node.op_type.startswith("Reduce") and reduced == [branches.axis]:
+        if node.op_type == "ReduceMax":
+            return largest(graph, node, branches.name, count, width)
+        if node.op_type not in ("ReduceMean", "ReduceSum"):
             return None
-        numbers = np.arange(branches * channels).reshape(branches, channels)[int(place)]
-        chosen = graph.add_constant(f"{node.result}.channels", numbers, np.int64)
-        return [node.replaced_by("Gather", [source, chosen], axis=1)]
+        share = count if node.op_type == "ReduceMean" else 1
+        weight = np.tile(np.eye(width) / share, count)[..., None, None]
+        return [graph.convolution(branches.name, node.result, node.name, weight)]
+    place = graph.value(node, 1) if node.op_type == "Gather" else None
+    if place is None or place.ndim or node.attribute("axis", 0) % 5 != branches.axis:
+        return None
+    numbers = np.arange(count * width).reshape(count, width)[int(place)]
+    chosen = graph.add_constant(f"{node.result}.channels", numbers, np.int64)
+    return [node.replaced_by("Gather", [branches.name, chosen], axis=1)]

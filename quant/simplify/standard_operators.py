@@ -283,27 +283,42 @@ def pool_maximum(graph: OnnxGraph, node: Node) -> Replacement:
     is_global = node.op_type == "GlobalMaxPool" or axes == {2, 3}
     if is_global and all(size[2:]):
         return [Node.new("MaxPool", [source], result, node.name, kernel_shape=list(size[2:]))]
-    channels = size[1]
-    if is_global or axes != {1} or not channels:
-        return None
+    return largest(graph, node, source, size[1], 1) if axes == {1} and size[1] else None
+
+
+def largest(graph: OnnxGraph, node: Node, source: str, count: int, width: int) -> list[Node]:
+    """Return the nodes that compute the largest of parts of the channels, by maxima of two halves
+    of the parts until one is left: max(a, b) = b + ReLU(a - b).
+
+    Args:
+        graph: the graph, whose constants are extended.
+        node: the maximum that is replaced.
+        source: the name of the map.
+        count: the number of parts.
+        width: the channels of each part.
+    """
+    result = node.result
     nodes: list[Node] = []
-    while channels > 1:
-        half = -(-channels // 2)
-        first = np.eye(half, channels)
-        # The last channel of an odd number is its own partner.
-        second = np.eye(channels)[np.minimum(np.arange(half) + half, channels - 1)]
+    while count > 1:
+        half = -(-count // 2)
+        first = np.eye(half, count)
+        # The last part of an odd number is its own partner.
+        second = np.eye(count)[np.minimum(np.arange(half) + half, count - 1)]
         names = [f"{result}.{half}.{role}" for role in ("difference", "relu", "second")]
         difference, limited, other = names
         larger = result if half == 1 else f"{result}.{half}"
+        parts = np.eye(width)
+        weights = [np.kron(weight, parts)[..., None, None] for weight in (first - second, second)]
         nodes += [
-            graph.convolution(source, difference, difference, (first - second)[..., None, None]),
+            graph.convolution(source, difference, difference, weights[0]),
             Node.new("Relu", [difference], limited),
-            graph.convolution(source, other, other, second[..., None, None]),
+            graph.convolution(source, other, other, weights[1]),
             Node.new("Add", [other, limited], larger, node.name if half == 1 else larger),
         ]
         source = larger
-        channels = half
-    return nodes or [graph.convolution(source, result, node.name, np.ones((1, 1, 1, 1)))]
+        count = half
+    identity = np.eye(width)[..., None, None]
+    return nodes or [graph.convolution(source, result, node.name, identity)]
 
 
 def shrink_by_convolution(graph: OnnxGraph, node: Node) -> Replacement:

@@ -67,14 +67,34 @@ def test_operators_of_exporters_are_folded_and_compute_the_same(case: str) -> No
             y = ReduceSum<keepdims=0>(m, one_int)""",
             {"Conv": 3, "Sigmoid": 1, "Mul": 1},
         ),
+        (
+            """n = Unsqueeze(c, first_axis) o = Unsqueeze(x, first_axis) s = Concat<axis=-5>(n, o)
+            y = ReduceMean<axes=[0], keepdims=0>(s)""",
+            {"Conv": 2, "Concat": 1},
+        ),
+        (
+            """n = Unsqueeze(c, last_axis) o = Unsqueeze(x, last_axis) r = Relu(x)
+            p = Unsqueeze(r, last_axis) s = Concat<axis=-1>(n, o, p)
+            y = ReduceMax<axes=[4], keepdims=0>(s)""",
+            {"Conv": 5, "Relu": 3, "Add": 2, "Concat": 1},
+        ),
+        (
+            """s = Reshape(c, of_two) m = Mul(s, shares)
+            y = ReduceSum<keepdims=0>(m, one_int)""",
+            {"Conv": 2},
+        ),
     ],
 )
 def test_branches_with_an_axis_of_their_own_are_channels(
     nodes: str, remaining: dict[str, int]
 ) -> None:
-    """SKNet selects the branches that it chooses among, and MIRNet adds them up."""
+    """SKNet selects the branches that it chooses among, MIRNet adds them up, DRCN weights them, and
+    others take the mean or maximum of stacked maps.
+    """
     ends = "float[2,4,9,11] x => float[N,C,H,W] y"
-    assert folded(network_from(f"{CONV} {nodes}", ends=ends)) == remaining
+    axes = {"first_axis": [0], "last_axis": [-1]}
+    shares = np.reshape([0.3, 0.7], (1, 2, 1, 1, 1))
+    assert folded(network_from(f"{CONV} {nodes}", ends=ends, shares=shares, **axes)) == remaining
 
 
 SWAP = "Transpose<perm=[1,0,2,3]>"
