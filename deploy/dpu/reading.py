@@ -17,14 +17,14 @@ import onnx
 
 from beers_deploy.dpu.graph import Kind, Operation, Shape, SizedGraph, kind_of, out_shape
 from beers_deploy.model.bank import GAINS, LARGEST, WIDE
-from beers_deploy.profiles.errors import ModelError, printable
+from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.rounding import up_to_multiple
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.quant.encodings import BORDER_PX, PLACE_PX, as_on_board
 from beers_deploy.quant.graph.pixel_shuffle import with_shuffles
 from beers_deploy.quant.graph.quantized import Integers
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
-from beers_deploy.quant.onnx.image_input import require_image
+from beers_deploy.quant.onnx.image_input import require_image, require_one_input
 from beers_deploy.quant.onnx.window import Sides, Window
 from beers_deploy.quant.onnx_file import faults_named, load_onnx, metadata
 from beers_deploy.quant.tiling.receptive_field import tiling_of
@@ -146,8 +146,12 @@ def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str) -> dict[s
     """
     place_px, border_px = _places(model)
     shapes: dict[str, Shape] = {}
-    for name, sizes in OnnxGraph(model).inputs.items():
+    inputs = OnnxGraph(model).inputs
+    for name, sizes in inputs.items():
         with faults_named(where):
+            # `check` and `bench` read networks of several images, but a parameter is none.
+            if len(sizes) < 4 or (sizes[2:] == [1, 1] and tile_px not in (None, 1)):
+                require_one_input(inputs)
             # Without a tile a network is predicted at the sizes that its file states, if it does.
             require_image(name, sizes, square=tile_px is not None or not all(sizes[2:]))
         if tile_px is None:
@@ -161,11 +165,6 @@ def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str) -> dict[s
             raise ModelError(
                 f"`tile` must be a multiple of {place_px} px for {where}, got {tile_px} px. Choose "
                 "another `tile`."
-            )
-        if list(sizes[2:]) == [1, 1] and side > 1:
-            raise ModelError(
-                f"The input {printable(name)} of {where} has one pixel, so it is a parameter and "
-                "no image. Export the network with it as a constant."
             )
         if sizes[2] not in (0, side):
             fixed_px = sizes[2] * place_px - 2 * border_px

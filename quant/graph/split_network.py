@@ -27,6 +27,7 @@ from beers_deploy.quant.graph.operations import (
     Resize,
     Shuffle,
 )
+from beers_deploy.quant.onnx.image_input import require_one_input
 from beers_deploy.quant.onnx.window import Sides
 from beers_deploy.quant.untrusted import times
 
@@ -86,12 +87,7 @@ def require_one_image(inputs: Collection[str], outputs: Collection[str]) -> None
         inputs: the names of the network's inputs.
         outputs: the names of the network's outputs.
     """
-    if len(inputs) != 1:
-        raise unsupported(
-            f"The network must have one input, the image, but it has {len(inputs)}: "
-            f"{', '.join(inputs)}.",
-            "Concatenate them along the channels into one input, and split that in the network.",
-        )
+    require_one_input(inputs)
     if len(outputs) != 1:
         raise unsupported(
             f"The network must have one output, but it has {len(outputs)}: {', '.join(outputs)}.",

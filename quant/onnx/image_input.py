@@ -3,7 +3,7 @@
 How an image may be cut into tiles for a network is determined in `quant.tiling`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from copy import deepcopy
 
 from onnx import ModelProto, TensorProto, ValueInfoProto, helper
@@ -18,15 +18,25 @@ def fixed_tile_px(model: ModelProto) -> int | None:
     Raises:
         ModelError: the model has not exactly one input, or it is not one image (`require_image`).
     """
-    if len(model.graph.input) != 1:
-        raise ModelError(
-            f"The network must have one input (N, C, H, W), but it has {len(model.graph.input)}. "
-            "Export it with one image as its input."
-        )
+    require_one_input([value.name for value in model.graph.input])
     image = model.graph.input[0]
     sizes = [d.dim_value for d in image.type.tensor_type.shape.dim]
     require_image(image.name, sizes)
     return sizes[2] or None
+
+
+def require_one_input(names: Collection[str]) -> None:
+    """Raise ModelError unless a network has exactly one input.
+
+    Args:
+        names: the names of its inputs.
+    """
+    if len(names) != 1:
+        raise ModelError(
+            f"The network must have one input, the image, but it has {len(names)}: "
+            f"{printable(', '.join(names))}. Export it with the others as constants, or as "
+            "channels of the image that the network splits."
+        )
 
 
 def require_image(name: str, sizes: Sequence[int], square: bool = True) -> None:

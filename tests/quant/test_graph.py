@@ -147,7 +147,7 @@ def test_transposed_convolutions_that_the_dpu_lacks_are_refused(
     ("end", "name", "channels", "message"),
     [
         ("output", "x", 2, "one output, but it has 2: restored, x.*as `output`"),
-        ("input", "level", 1, r"has 2: image, level\. Concatenate them"),
+        ("input", "level", 1, r"has 2: image, level\. Export it with the others"),
     ],
 )
 def test_two_inputs_or_outputs_are_refused_by_name(
