@@ -7,10 +7,9 @@ from enum import StrEnum
 
 import numpy as np
 
-from beers_deploy.quant.adapt.zero_padding import pads_of
 from beers_deploy.quant.graph.attention import shrinking
 from beers_deploy.quant.graph.host_end import host_end
-from beers_deploy.quant.graph.mirror import image_mirror
+from beers_deploy.quant.graph.mirror import image_mirror, pads_of
 from beers_deploy.quant.graph.normalization import Normalization, lone_deviation
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph

@@ -10,29 +10,12 @@ import onnx
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.rounding import up_to_multiple
+from beers_deploy.quant.graph.mirror import pads_of
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Replacement
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 
 MIRRORED_PX = 16
 """The width of the mirrored border in pixels, rounded up to a multiple of the strides."""
-
-
-def pads_of(graph: OnnxGraph, node: Node) -> tuple[int, ...]:
-    """Return top, left, bottom and right of a Pad by reflection or edge that only convolutions
-    read; empty for any other node.
-
-    Args:
-        graph: the graph that the node belongs to.
-        node: any node.
-    """
-    if node.op_type != "Pad" or node.attribute("mode") not in ("edge", "reflect"):
-        return ()
-    readers = {reader.op_type for reader in graph.readers[node.result]}
-    amounts = graph.numbers(node, 1, "pads") or []
-    is_of_pixels = len(amounts) == 8 and not any((*amounts[:2], *amounts[4:6]))
-    if readers != {"Conv"} or not is_of_pixels or min(amounts) < 0:
-        return ()
-    return (*amounts[2:4], *amounts[6:])
 
 
 def pad_by_zeros(model: onnx.ModelProto) -> None:

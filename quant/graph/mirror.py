@@ -1,4 +1,4 @@
-"""Find the border by which a network mirrors its image, which the host can do instead."""
+"""Find padding by reflection: of the image, which the host can do instead, and of other maps."""
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.resize import enlarges_image
@@ -27,3 +27,21 @@ def image_mirror(graph: OnnxGraph) -> tuple[Node, int] | None:
     if pad.attribute("mode") != "reflect" or not is_even or border_px < 1:
         return None
     return pad, border_px
+
+
+def pads_of(graph: OnnxGraph, node: Node) -> tuple[int, ...]:
+    """Return top, left, bottom and right of a Pad by reflection or edge that only convolutions
+    read; empty for any other node.
+
+    Args:
+        graph: the graph that the node belongs to.
+        node: any node.
+    """
+    if node.op_type != "Pad" or node.attribute("mode") not in ("edge", "reflect"):
+        return ()
+    readers = {reader.op_type for reader in graph.readers[node.result]}
+    amounts = graph.numbers(node, 1, "pads") or []
+    is_of_pixels = len(amounts) == 8 and not any((*amounts[:2], *amounts[4:6]))
+    if readers != {"Conv"} or not is_of_pixels or min(amounts) < 0:
+        return ()
+    return (*amounts[2:4], *amounts[6:])

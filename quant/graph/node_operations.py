@@ -122,7 +122,8 @@ def _window(node: Node, kernel: Sequence[int] = ()) -> tuple[Sides, Window]:
 
 def _read_concat(graph: OnnxGraph, node: Node) -> Op:
     axis = node.attribute("axis")
-    require(axis in (1, -3), node, f"must concatenate along the channels, got axis {axis}")
+    rule = f"must concatenate along the channels, got axis {axis}"
+    require(axis in (1, -3), node, rule, "Compute maps whole, not in parts.")
     computed = graph.constants.keys().isdisjoint(node.inputs)
     require(computed, node, "must concatenate computed tensors, got a constant")
     return Concat(node.name, node.inputs, node.result)

@@ -13,7 +13,7 @@ from onnx import ModelProto
 from beers_deploy.profiles.errors import ModelError, counted
 from beers_deploy.quant.graph.attention import aligned, shrinking
 from beers_deploy.quant.graph.host_end import host_end
-from beers_deploy.quant.graph.mirror import image_mirror
+from beers_deploy.quant.graph.mirror import image_mirror, pads_of
 from beers_deploy.quant.graph.node_operations import ACTIVATIONS, READERS, read_activation, require
 from beers_deploy.quant.graph.normalization import Normalization, lone_deviation
 from beers_deploy.quant.graph.operations import (
@@ -64,27 +64,33 @@ STATISTICS = (
     "attention have it. Train the network with batch normalization, which becomes part of the "
     "convolutions, and with global average pooling."
 )
+NO_ATTENTION = (
+    "A DPU has only convolutions of constant weights. Train a network without self-attention, such "
+    "as NAFNet."
+)
+NO_SOFTMAX = "Leave it out at the end of a network; within one, train with Sigmoid."
 FIX_SIZE = (
     "Export it with fixed height and width, or give the file some: python -m "
     "onnxruntime.tools.make_dynamic_shape_fixed."
 )
 OF_ONE_SIZE = f"The network computes with the size of its image. {FIX_SIZE}"
 REMEDIES = {
-    **dict.fromkeys(("Flatten", "Gemm", "MatMul", "NonMaxSuppression", "Softmax"), NO_IMAGE),
+    **dict.fromkeys(("Flatten", "Gemm", "MatMul", "NonMaxSuppression"), NO_IMAGE),
     **dict.fromkeys(
-        ("GroupNormalization", "InstanceNormalization", "LayerNormalization"), NORMALISES
+        ("GroupNormalization", "InstanceNormalization", "LayerNormalization", "ReduceL2"),
+        NORMALISES,
     ),
-    **dict.fromkeys(("ReduceL2", "ReduceMax", "ReduceMean", "ReduceSum"), STATISTICS),
+    **dict.fromkeys(("ReduceMax", "ReduceMean", "ReduceSum"), STATISTICS),
     **dict.fromkeys(("PRelu", "Sigmoid", "Tanh", "Gelu", "Erf", "Mish"), ADAPT),
     **dict.fromkeys(
         ("ConstantOfShape", "Expand", "GlobalMaxPool", "Shape", "Size", "Tile"), OF_ONE_SIZE
     ),
-    "Pad": (
-        "Pad by zeros in the convolution; 'quantize --adapt' (adapt=True) replaces reflecting "
-        "padding in front of convolutions, and measures the cost."
-    ),
+    "Pad": "Let convolutions pad by zeros, and train the network again.",
+    "Softmax": NO_SOFTMAX,
 }
 """Advice for each operator that no DPU computes."""
+NEVER = (NO_SOFTMAX, NORMALISES, STATISTICS)
+"""Advice for operators that are refused at any size of the image."""
 OTHER_REMEDY = "Replace it by one that the DPU computes, or cut the network in front of it."
 
 
@@ -227,7 +233,15 @@ class _Reader:
                 NO_IMAGE,
             )
         for node in self.source.nodes:
-            if node.op_type == "Pad" or REMEDIES.get(node.op_type) in (NORMALISES, STATISTICS):
+            is_product = node.op_type in ("Einsum", "MatMul")
+            if is_product and self.source.constants.keys().isdisjoint(node.inputs):
+                fault = f"{node} multiplies two computed maps, as self-attention does."
+                raise unsupported(fault, NO_ATTENTION)
+        # Last what can be adapted, because other faults would remain.
+        for node in sorted(self.source.nodes, key=lambda node: bool(pads_of(self.source, node))):
+            if node.op_type == "Concat" and node.attribute("axis") in (2, 3, -2, -1):
+                READERS[node.op_type](self.source, node)
+            if node.op_type == "Pad" or REMEDIES.get(node.op_type) in NEVER:
                 raise _refused(self.source, node)
             if node.op_type == "Resize" and node.result not in self.end.replaced:
                 with suppress(AdaptableError):
@@ -317,4 +331,6 @@ def _refused(graph: OnnxGraph, node: Node) -> ModelError:
         remedy = ADAPT
     if node.op_type == "Pad" and graph.numbers(node, 1, "pads") is None:
         remedy = OF_ONE_SIZE
+    if pads_of(graph, node):
+        remedy = ADAPT
     return unsupported(f"The DPU does not compute the operation {node}.", remedy)

@@ -22,6 +22,7 @@ NUMBERS = {
     "twice": [1.0, 1.0, 2.0, 2.0],
     "ones": np.ones(36),
     "split": [0, 4, 18, 2, 18, 2],
+    "around": [0, 0, 1, 1, 0, 0, 1, 1],
     "joined": [0, 16, 18, 18],
 }
 DEAD = np.array([0.1, -9.0, 0.2, -9.0, 0.1])
@@ -260,6 +261,13 @@ REFUSED = {
     ),
     "Mul out must have a constant of one number for each channel, got 36": sketch(
         "c = Conv(in, c_w, c_b) out = Mul(c, ones)", 36, 36, c=(36, 1, 1, 1)
+    ),
+    "self-attention": sketch("c = Conv(in, c_w, c_b) out = MatMul(c, c)", c=(1, 1, 1, 1)),
+    "Concat rows must concatenate along the channels": sketch(
+        "[rows] rows = Concat<axis=2>(in, in) mean = ReduceMax(rows) out = Mul(in, mean)"
+    ),
+    "Let convolutions pad by zeros, and train the network again.$": sketch(
+        "padded = Pad(in, around) out = Relu(padded)"
     ),
     "cut the network in front of it. 'check' and 'bench' read any network": sketch(
         "c = Conv(in, c_w, c_b) mean = GlobalAveragePool(c) out = Flatten(mean)",
