@@ -217,7 +217,8 @@ class _Reader:
             )
         if not (rows and columns):
             check_result_size(graph, self.border_px, self.end.crop_px)
-        return sized(graph, (rows, columns)) if pools else graph
+        border_px = 2 * self.border_px
+        return sized(graph, (rows + border_px, columns + border_px)) if pools else graph
 
     def _check_whole(self) -> None:
         """Raise ModelError for faults of the whole network, and for those that no image size would

@@ -211,6 +211,20 @@ VALID = {
         c=(4, 1, 3, 3),
         last=(1, 4, 3, 3),
     ),
+    "squeezed behind a mirrored border": sketch(
+        """wide = Pad<mode="reflect">(in, around)
+        c = Conv(wide, c_w, c_b)
+        r = Relu(c)
+        mean = GlobalAveragePool(r)
+        g = Conv(mean, g_w, g_b)
+        gated = Mul(g, r)
+        out = Conv(gated, out_w, out_b)""",
+        side=36,
+        sizes={"out": 1.0},
+        c=(5, 1, 3, 3),
+        g=(5, 5, 1, 1),
+        out=(1, 5, 1, 1),
+    ),
     "squeezed": sketch(
         f"""c = {SAME}(in, c_w, c_b)
         r = Relu(c)
