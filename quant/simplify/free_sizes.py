@@ -177,6 +177,8 @@ def _sized(graph: OnnxGraph, node: Node) -> Replacement:
     moves = node.op_type == "Transpose" or takes_others(graph, node)
     if moves or (node.op_type in RESHAPING and before != after):
         return multiplied(graph, node) or _with_kept_axis(graph, node) or rearranged(graph, node)
+    if node.op_type in RESHAPING and (operator := rearranged(graph, node)):
+        return operator
     if len(before) != 4 or len(after) != 4 or min(*before, *after) < 1:
         return None
     if node.op_type in SPECIAL:

@@ -7,8 +7,8 @@ a map of numbered values:
 
 1. If each channel of the result is a channel of the map, or one place of its blocks of r x r
    pixels, it is a convolution of r x r pixels and stride r that selects them. A pixel unshuffle of
-   one channel is a SpaceToDepth. ONNX orders several channels in another way, and the host
-   unshuffles an image of several channels.
+   one channel is a SpaceToDepth, and so is one of the image in front of convolutions, whose weights
+   are reordered.
 2. If each pixel becomes a block, it is a nearest Resize, and if the channels become a block, a
    DepthToSpace. `quant.graph.pixel_shuffle` reads one whose sizes are constants.
 3. If each value stays in its place, nothing is needed.
@@ -22,6 +22,7 @@ from functools import partial, reduce
 import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Replacement
+from beers_deploy.quant.simplify.slices import unshuffled
 
 RESHAPING = {"Flatten", "Reshape", "Squeeze", "Unsqueeze"}
 """Operators that move no value."""
@@ -92,7 +93,9 @@ def rearranged(graph: OnnxGraph, node: Node) -> Replacement:
     if block > 1 and np.array_equal(order, np.arange(block * block)):
         return [node.replaced_by("SpaceToDepth", [source], blocksize=block)]
     if block > 1 and source in graph.inputs:
-        return None
+        # ONNX counts the places of a block first, then the channels.
+        channel, place = np.divmod(order, block * block)
+        return unshuffled(graph, node, source, block, place * channels + channel)
     weight = np.eye(blocks.shape[1])[order].reshape(-1, channels, block, block)
     return [graph.convolution(source, result, node.name, weight, strides=[block, block])]
 

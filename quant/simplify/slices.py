@@ -60,29 +60,42 @@ def unshuffle_slices(graph: OnnxGraph, node: Node) -> Replacement:
     """
     if node.op_type != "Concat" or node.attribute("axis") not in (1, -3):
         return None
-    origins = {_origin(graph, name)[0] for name in node.inputs}
-    source, *others = origins
+    source, *others = {_origin(graph, name)[0] for name in node.inputs}
     size = graph.shapes.get(source, ())
+    if others or len(size) != 4 or size[1] < 1:
+        return None
+    for block in BLOCKS:
+        order = _order(graph, node, size[1], block)
+        if order is not None:
+            return unshuffled(graph, node, source, block, order)
+    return None
+
+
+def unshuffled(
+    graph: OnnxGraph, node: Node, source: str, block: int, order: np.ndarray
+) -> Replacement:
+    """Return the pixel unshuffle that replaces a node if only convolutions read it, whose weights
+    are reordered (point 2 of the module).
+
+    Args:
+        graph: the graph that the node belongs to. Those convolutions get other weights.
+        node: the node that is replaced.
+        source: the name of the map.
+        block: side of the unshuffle's blocks in pixels.
+        order: the unshuffle's channel that each channel of the node is.
+    """
     readers = graph.readers[node.result]
     takes_order = all(
         reader.op_type == "Conv" and is_convolution(graph, reader) and reader.groups == 1
         for reader in readers
     )
-    is_read = readers and node.result not in graph.outputs
-    if others or len(size) != 4 or size[1] < 1 or not is_read or not takes_order:
+    if not readers or node.result in graph.outputs or not takes_order:
         return None
-    for block in BLOCKS:
-        order = _order(graph, node, size[1], block)
-        if order is None:
-            continue
-        # 2.
-        for reader in readers:
-            weight = graph.constants[reader.inputs[1]]
-            # Channel k of the Concat is channel order[k] of the unshuffle.
-            name = graph.add_constant(f"{reader.name}.weight", weight[:, np.argsort(order)])
-            reader.inputs = (reader.source, name, *reader.inputs[2:])
-        return [node.replaced_by("SpaceToDepth", [source], blocksize=block)]
-    return None
+    for reader in readers:
+        weight = graph.constants[reader.inputs[1]]
+        name = graph.add_constant(f"{reader.name}.weight", weight[:, np.argsort(order)])
+        reader.inputs = (reader.source, name, *reader.inputs[2:])
+    return [node.replaced_by("SpaceToDepth", [source], blocksize=block)]
 
 
 def _origin(graph: OnnxGraph, name: str) -> tuple[str, list[Node]]:
