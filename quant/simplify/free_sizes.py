@@ -319,21 +319,25 @@ SPECIAL: dict[str, Rewriting] = {
 
 
 def _with_kept_axis(graph: OnnxGraph, node: Node) -> Replacement:
-    """Return the mean of a map over its channels, times a constant, in place of one that drops the
-    axis, which a Reshape adds again, as torch writes a variance; None if the node is no such
-    Reshape.
+    """Return the mean or maximum of a map over its channels, times a constant, in place of one that
+    drops the axis, which a Reshape adds again, as torch writes a variance and CBAM's attention;
+    None if the node is no such Reshape.
     """
     source, affine = affine_chain(graph, node.source)
-    mean = graph.writer(source)
-    if mean.op_type != "ReduceMean" or graph.numbers(mean, 1, "axes") != [1]:
+    before = graph.writer(source)
+    is_of_channels = graph.numbers(before, 1, "axes") == [1]
+    if before.op_type not in ("ReduceMax", "ReduceMean") or not is_of_channels:
         return None
-    batch, _, *sides = graph.shapes.get(mean.source, (0, 0))
+    batch, _, *sides = graph.shapes.get(before.source, (0, 0))
     is_kept = len(sides) == 2 and graph.shapes.get(node.result) == (batch, 1, *sides)
     if not is_kept or affine.shift.any():
         return None
-    mean_name = f"{node.result}.mean"
-    factor = graph.add_constant(f"{mean_name}.factor", affine.scale)
+    attributes = {**before.attributes, "keepdims": 1}
+    if (affine.scale == 1).all():
+        return [node.replaced_by(before.op_type, before.inputs, **attributes)]
+    reduced = f"{node.result}.reduced"
+    factor = graph.add_constant(f"{reduced}.factor", affine.scale)
     return [
-        Node.new("ReduceMean", mean.inputs, mean_name, **{**mean.attributes, "keepdims": 1}),
-        node.replaced_by("Mul", [mean_name, factor]),
+        Node.new(before.op_type, before.inputs, reduced, **attributes),
+        node.replaced_by("Mul", [reduced, factor]),
     ]

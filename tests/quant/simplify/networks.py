@@ -321,6 +321,11 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         {"GlobalAveragePool": 1, "Mul": 1},
     ),
     "a mean over channels": ("y = ReduceMean<axes=[1]>(x)", {"Conv": 1}),
+    # CBAM's spatial attention.
+    "the largest channel, whose axis is dropped": (
+        "m = ReduceMax<axes=[1], keepdims=0>(x) y = Unsqueeze(m, one_int)",
+        {"Conv": 4, "Relu": 2, "Add": 2},
+    ),
     "the largest channel": ("y = ReduceMax<axes=[1]>(x)", {"Conv": 4, "Relu": 2, "Add": 2}),
     "the largest of three channels": (
         "s = Slice(x, one_int, last, one_int) y = ReduceMax<axes=[-3]>(s)",
