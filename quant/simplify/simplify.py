@@ -84,7 +84,7 @@ from beers_deploy.quant.simplify.fully_connected import ConnectByConvolutions, c
 from beers_deploy.quant.simplify.image_mixtures import ReadImage
 from beers_deploy.quant.simplify.image_residual import add_to_image, clip_last
 from beers_deploy.quant.simplify.missing_border import with_missing_border
-from beers_deploy.quant.simplify.slices import convolve_slice, unshuffle_slices
+from beers_deploy.quant.simplify.slices import convolve_slice, slice_by_pads, unshuffle_slices
 from beers_deploy.quant.simplify.spelled_activations import (
     halve_before_gelu,
     join_clips,
@@ -182,6 +182,7 @@ def _run_passes(model: ModelProto) -> None:
     graph.infer_shapes()
     for replacement in (
         JoinBranches(),
+        slice_by_pads,
         clip_last,
         split_soft_threshold,
         choose_by_relu,

@@ -7,6 +7,7 @@
 3. A U-Net without padding crops its skips to the size of the enlarged map. In a kernel of three
    rows the first and the last reach the border that is cut, and the one in the middle has the only
    weight, 1.
+   torch's users crop by a Pad of negative numbers, too.
 4. A wavelet transform selects every n-th row. The only weight of a kernel of stride n lies at its
    end, where the first selected row is.
 
@@ -137,6 +138,27 @@ def _order(graph: OnnxGraph, node: Node, channels: int, block: int) -> np.ndarra
     # Each channel is known by its first pixel.
     order = (result[0, :, :1, 0] == unshuffled[0, :, 0, 0]).argmax(1)
     return order if np.array_equal(unshuffled[:, order], result) else None
+
+
+def slice_by_pads(graph: OnnxGraph, node: Node) -> Replacement:
+    """Replace a Pad by negative numbers of rows and columns, which crops, by a Slice.
+
+    Args:
+        graph: the graph that the node belongs to; its constants are extended.
+        node: any node.
+
+    Returns:
+        The Slice; None if the node is something else.
+    """
+    amounts = np.array(graph.numbers(node, 1, "pads") if node.op_type == "Pad" else None)
+    if amounts.shape != (8,) or amounts.max() > 0 or amounts[[0, 1, 4, 5]].any():
+        return None
+    stops = [stop or TO_THE_END for stop in amounts[6:].tolist()]
+    places = [
+        graph.add_constant(f"{node.result}.{role}", numbers, np.int64)
+        for role, numbers in (("starts", -amounts[2:4]), ("stops", stops), ("axes", [2, 3]))
+    ]
+    return [node.replaced_by("Slice", [node.source, *places])]
 
 
 def convolve_slice(graph: OnnxGraph, node: Node) -> Replacement:

@@ -41,6 +41,7 @@ NUMBERS = {
     "none": [],
     "pads": [0, 0, 1, 1, 0, 0, 1, 1],
     "around": [0, 0, 1, 2, 0, 0, 2, 1],
+    "cropping": [0, 0, -1, -2, 0, 0, -1, -2],
     "small": [2, 4, 2, 3],
     "rows": [0, -1],
     "order": [2, 0, 3],
@@ -321,6 +322,10 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         {"GlobalAveragePool": 1, "Mul": 1},
     ),
     "a mean over channels": ("y = ReduceMean<axes=[1]>(x)", {"Conv": 1}),
+    "cropped by negative pads": (
+        "p = Pad(x, cropping) y = Conv(p, w)",
+        {"Conv": 2},
+    ),
     # CBAM's spatial attention.
     "the largest channel, whose axis is dropped": (
         "m = ReduceMax<axes=[1], keepdims=0>(x) y = Unsqueeze(m, one_int)",
