@@ -234,10 +234,14 @@ def _with_stated_sizes(graph: OnnxGraph, node: Node) -> Replacement:
 
 
 def _by_factors(graph: OnnxGraph, node: Node) -> Replacement:
-    """Return a Resize by factors in place of one to a size; None if no whole number divides one of
-    the sizes into the other, so that factors may be rounded, and the result have another size.
+    """Return a Resize by factors in place of one to a size, and nothing but another name for one to
+    the map's own size; None if no whole number divides one of the sizes into the other, so that
+    factors may be rounded, and the result have another size.
     """
     before = graph.shapes[node.source]
+    crops = node.attribute("coordinate_transformation_mode") == "tf_crop_and_resize"
+    if before == graph.shapes[node.result] and not crops:
+        return [node.replaced_by("Identity", [node.source])]
     factors = np.divide(graph.shapes[node.result], before)
     if len(node.inputs) < 4 or any(factor % 1 and (1 / factor) % 1 for factor in factors):
         return None

@@ -52,7 +52,7 @@ class PaddedUNet(nn.Module):
 
 class ResizedUNet(PaddedUNet):
     """A U-Net that pools an incomplete pair of rows too, as U2-Net does, resizes features to the
-    size of the skip, and clips its result.
+    size of the skip, and the result to that of the image, and clips it.
     """
 
     def __init__(self) -> None:
@@ -65,7 +65,10 @@ class ResizedUNet(PaddedUNet):
 
     def forward(self, image: Tensor) -> Tensor:
         """Map images (N, 1, H, W) to the same shape."""
-        return torch.clamp(image + super().forward(image), 0, 1)
+        result = functional.interpolate(
+            super().forward(image), size=image.shape[2:], mode="bilinear"
+        )
+        return torch.clamp(image + result, 0, 1)
 
 
 class DeepUNet(nn.Module):
