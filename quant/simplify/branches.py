@@ -93,7 +93,7 @@ class JoinBranches:
             difference = f"{node.result}.difference"
             weight = np.kron([[1, -1], [-1, 1]], np.eye(branches.width))[..., None, None]
             conv = graph.convolution(branches.name, difference, difference, weight)
-            return [conv, Node.new("Sigmoid", [difference], joined, node.name)]
+            return [conv, Node.new("Sigmoid", [difference], joined)]
         factors = graph.value(node, 1) if node.op_type == "Mul" else None
         if factors is not None and factors.ndim == 5:
             # One number for each branch.
@@ -101,7 +101,7 @@ class JoinBranches:
                 return []
             scales = np.repeat(factors, branches.width).reshape(1, -1, 1, 1)
             constant = graph.add_constant(f"{joined}.factors", scales)
-            return [Node.new("Mul", [branches.name, constant], joined, node.name)]
+            return [Node.new("Mul", [branches.name, constant], joined)]
         if not self._maps.keys() >= {*node.inputs}:
             return []
         parts = [self._maps[name] for name in node.inputs]
@@ -109,9 +109,9 @@ class JoinBranches:
         if len({(part.axis, part.width) for part in parts}) > 1:
             return []
         if node.op_type == "Concat" and is_along:
-            return [Node.new("Concat", maps, joined, node.name, axis=1)]
+            return [Node.new("Concat", maps, joined, axis=1)]
         if node.op_type == "Mul" and len({part.count for part in parts}) == 1:
-            return [Node.new("Mul", maps, joined, node.name)]
+            return [Node.new("Mul", maps, joined)]
         return []
 
 

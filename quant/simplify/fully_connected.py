@@ -75,7 +75,7 @@ class ConnectByConvolutions:
         operand = graph.numbers(node, 1, "") or []
         if node.op_type == "Squeeze" and operand:
             return {axis % 4 for axis in operand} == {2, 3}
-        if node.op_type != "Reshape" or len(operand) != 2 or node.attribute("allowzero", 0):
+        if node.op_type != "Reshape" or len(operand) != 2:
             return False
         # In ONNX's Reshape a 0 copies the source's size and -1 stands for the remaining values.
         rows, columns = operand

@@ -177,11 +177,10 @@ def drop_cast_or_reshape(graph: OnnxGraph, node: Node) -> Replacement:
     if size is None or graph.sole_writer(node.source) is NO_NODE:
         return None
     is_cast = node.op_type == "Cast" and node.attribute("to") == TensorProto.FLOAT
-    is_reshape = node.op_type == "Reshape" and not node.attribute("allowzero")
     # 0 copies a side, and the one that is -1 follows from the others.
     stated = graph.numbers(node, 1, "") or ()
     is_kept = [number in (0, -1, side) for number, side in zip(stated, size, strict=False)]
-    keeps_sides = is_reshape and len(stated) == len(size) and all(is_kept)
+    keeps_sides = node.op_type == "Reshape" and len(stated) == len(size) and all(is_kept)
     if not (is_cast or keeps_sides):
         return None
     graph.rename(node.source, node.result)
