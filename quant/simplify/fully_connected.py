@@ -4,7 +4,7 @@
 2. A Gemm on such a map becomes a convolution of the whole map.
 3. Activations of a flat tensor, and its arithmetic with one number, are applied to the map instead,
    and a Softmax over a flat tensor becomes one along the channels of one pixel.
-4. A Reshape that restores the map is removed, and the flattening with it.
+4. A Reshape or Unsqueeze that restores the map is removed, and the flattening with it.
 5. A convolution along the channels of one pixel, as in efficient channel attention (ECA), becomes a
    convolution of that pixel that connects neighbouring channels.
 
@@ -56,13 +56,19 @@ class ConnectByConvolutions:
         is_scaled = node.op_type in ARITHMETIC and operand is not None and operand.size == 1
         if node.op_type in POINTWISE or is_scaled:
             return self._flat(replace(node, inputs=(source, *node.inputs[1:])), size)
-        is_private = (
-            graph.n_reads(name) == 1 and graph.n_reads(source) <= 1 and source in graph.writers
-        )
-        maps = [1, *size], [0, *size], [-1, *size]
-        if is_private and node.op_type == "Reshape" and graph.numbers(node, 1, "") in maps:
+        return self._restored(graph, node) if node.op_type in ("Reshape", "Unsqueeze") else None
+
+    def _restored(self, graph: OnnxGraph, node: Node) -> Replacement:
+        """Return an empty list for a node that only restores a map; None for another (4)."""
+        source, size = self._maps[node.source]
+        sides = graph.shapes.get(node.result, ())[1:]
+        is_private = graph.n_reads(node.source) == 1 and graph.n_reads(source) <= 1
+        if is_private and source in graph.writers and sides == size:
             graph.rename(source, node.result)
             return []
+        # One pixel may get its axes one after the other.
+        if sides == size[:2] and size[1:] == (1, 1):
+            self._maps[node.result] = source, size
         return None
 
     def _flattens(self, graph: OnnxGraph, node: Node) -> bool:
@@ -79,7 +85,7 @@ class ConnectByConvolutions:
             return False
         # In ONNX's Reshape a 0 copies the source's size and -1 stands for the remaining values.
         rows, columns = operand
-        return columns == prod(sizes[1:]) or (columns == -1 and rows in (0, sizes[0]))
+        return (columns or sizes[1]) == prod(sizes[1:]) or (columns == -1 and rows in (0, sizes[0]))
 
     def _connected(self, graph: OnnxGraph, node: Node, source: str, size: Map) -> Replacement:
         """Return the convolution that computes a Gemm on a map of this size (2)."""

@@ -61,6 +61,8 @@ NUMBERS = {
     "stops": [2**31 - 1, -2, -1, 2**31 - 1],
     "four_axes": [0, 2, 3, 1],
     "map_again": [-1, 4, 1, 1],
+    "copied": [0, 0],
+    "again": [-1, 0, 1, 1],
     "four_channels": [1, 4, 1, 1],
 }
 
@@ -312,14 +314,19 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
     "a mean, fully connected": (
         """m = ReduceMean<axes=[2,3], keepdims=0>(x)
         g = Gemm<transB=1>(m, square, b)
-        y = Unsqueeze(g, axes)""",
-        {"GlobalAveragePool": 1, "Conv": 1, "Flatten": 1, "Unsqueeze": 1},
+        u = Unsqueeze(g, two)
+        y = Unsqueeze(u, columns)""",
+        {"GlobalAveragePool": 1, "Conv": 1},
     ),
     "a mean, scaled and restored to a map": (
         """m = ReduceMean<axes=[2,3], keepdims=0>(x)
         d = Mul(m, six)
         y = Reshape(d, map_again)""",
         {"GlobalAveragePool": 1, "Mul": 1},
+    ),
+    "a mean, fully connected, of copied sizes": (
+        "m = GlobalAveragePool(x) f = Reshape(m, copied) g = Gemm(f, square) y = Reshape(g, again)",
+        {"GlobalAveragePool": 1, "Conv": 1},
     ),
     "a mean over channels": ("y = ReduceMean<axes=[1]>(x)", {"Conv": 1}),
     "cropped by negative pads": (
@@ -389,11 +396,11 @@ CASES: dict[str, tuple[str, dict[str, int]]] = {
         r = Relu(g)
         h = Gemm(r, square)
         y = Unsqueeze(h, axes)""",
-        {"MaxPool": 1, "GlobalAveragePool": 1, "Conv": 2, "Relu": 1, "Flatten": 1, "Unsqueeze": 1},
+        {"MaxPool": 1, "GlobalAveragePool": 1, "Conv": 2, "Relu": 1},
     ),
     "fully connected to a map of known size": (
         "s = Resize(x, , , small) f = Reshape(s, rows) g = Gemm(f, wide) y = Unsqueeze(g, axes)",
-        {"Resize": 1, "Conv": 1, "Flatten": 1, "Unsqueeze": 1},
+        {"Resize": 1, "Conv": 1},
     ),
     "probabilities of classes": (
         """l = Mul(x, six)
