@@ -65,10 +65,9 @@ STATISTICS = (
     "convolutions, and with global average pooling."
 )
 NO_ATTENTION = (
-    "A DPU has only convolutions of constant weights. Train a network without self-attention, such "
-    "as NAFNet."
+    "A DPU has only convolutions of constant weights. Train a network without self-attention and "
+    "computed kernels, such as NAFNet."
 )
-NO_SOFTMAX = "Leave it out at the end of a network; within one, train with Sigmoid."
 FIX_SIZE = (
     "Export it with fixed height and width, or give the file some: python -m "
     "onnxruntime.tools.make_dynamic_shape_fixed."
@@ -86,10 +85,10 @@ REMEDIES = {
         ("ConstantOfShape", "Expand", "GlobalMaxPool", "Shape", "Size", "Tile"), OF_ONE_SIZE
     ),
     "Pad": "Let convolutions pad by zeros, and train the network again.",
-    "Softmax": NO_SOFTMAX,
+    "Softmax": "Leave it out at the end of a network; within one, train with Sigmoid.",
 }
 """Advice for each operator that no DPU computes."""
-NEVER = (NO_SOFTMAX, NORMALISES, STATISTICS)
+NEVER = (NORMALISES, STATISTICS)
 """Advice for operators that are refused at any size of the image."""
 OTHER_REMEDY = "Replace it by one that the DPU computes, or cut the network in front of it."
 
@@ -233,11 +232,7 @@ class _Reader:
                 f"{counted(len(dims), 'dimension')}.",
                 NO_IMAGE,
             )
-        for node in self.source.nodes:
-            is_product = node.op_type in ("Einsum", "MatMul")
-            if is_product and self.source.constants.keys().isdisjoint(node.inputs):
-                fault = f"{node} multiplies two computed maps, as self-attention does."
-                raise unsupported(fault, NO_ATTENTION)
+        self._check_tensors()
         # Last what can be adapted, because other faults would remain.
         for node in sorted(self.source.nodes, key=lambda node: bool(pads_of(self.source, node))):
             if node.op_type == "Concat" and node.attribute("axis") in (2, 3, -2, -1):
@@ -247,6 +242,22 @@ class _Reader:
             if node.op_type == "Resize" and node.result not in self.end.replaced:
                 with suppress(AdaptableError):
                     READERS[node.op_type](self.source, node)
+
+    def _check_tensors(self) -> None:
+        """Raise ModelError for what only another network avoids: products of computed tensors, and
+        tensors that are no maps.
+        """
+        for node in self.source.nodes:
+            if node.op_type in ("DFT", "Softmax"):
+                raise _refused(self.source, node)
+            is_product = node.op_type in ("Conv", "Einsum", "MatMul")
+            if is_product and self.source.constants.keys().isdisjoint(node.inputs[:2]):
+                raise unsupported(f"{node} multiplies computed tensors.", NO_ATTENTION)
+        self.source.infer_shapes()
+        for node in self.source.nodes:
+            if len(self.source.shapes.get(node.result, ())) > 4:
+                fault = f"{node} makes a tensor of more than four dimensions."
+                raise unsupported(fault, "Stack maps along the channels.")
 
     def _read(self, node: Node) -> None:
         if node.op_type in ACTIVATIONS:

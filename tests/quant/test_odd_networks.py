@@ -21,6 +21,7 @@ NUMBERS = {
     "six": 6.0,
     "twice": [1.0, 1.0, 2.0, 2.0],
     "ones": np.ones(36),
+    "one": [1],
     "split": [0, 4, 18, 2, 18, 2],
     "around": [0, 0, 1, 1, 0, 0, 1, 1],
     "joined": [0, 16, 18, 18],
@@ -276,7 +277,11 @@ REFUSED = {
     "Mul out must have a constant of one number for each channel, got 36": sketch(
         "c = Conv(in, c_w, c_b) out = Mul(c, ones)", 36, 36, c=(36, 1, 1, 1)
     ),
-    "self-attention": sketch("c = Conv(in, c_w, c_b) out = MatMul(c, c)", c=(1, 1, 1, 1)),
+    "without self-attention": sketch("c = Conv(in, c_w, c_b) out = MatMul(c, c)", c=(1, 1, 1, 1)),
+    "Stack maps along the channels": sketch(
+        "c = Conv(in, c_w, c_b) deep = Unsqueeze(c, one) r = Exp(deep) out = Squeeze(r, one)",
+        c=(1, 1, 1, 1),
+    ),
     "Concat rows must concatenate along the channels": sketch(
         "[rows] rows = Concat<axis=2>(in, in) mean = ReduceMax(rows) out = Mul(in, mean)"
     ),
