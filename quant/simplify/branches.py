@@ -58,7 +58,8 @@ class JoinBranches:
             self._start(graph, node)
             return None
         branches = self._maps.get(node.source)
-        if branches is None:
+        # What an earlier run of the pass has joined remains if a node reads it.
+        if branches is None or f"{node.result}.joined" in graph.writers:
             return None
         if len(after) == 4:
             return _out_of(graph, node, branches)

@@ -29,6 +29,7 @@ from beers_deploy.quant.onnx.elementwise import ELEMENTWISE
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, Replacement, Rewriting
 from beers_deploy.quant.onnx.image_input import without_size
 from beers_deploy.quant.onnx.messages import replace_all
+from beers_deploy.quant.simplify.branches import JoinBranches
 from beers_deploy.quant.simplify.channels_first import TO_LAST, moved_behind, multiplied
 from beers_deploy.quant.simplify.convolutions import leaves_pads
 from beers_deploy.quant.simplify.fold_affine import affine_chain
@@ -156,6 +157,7 @@ def _of_size(model: ModelProto, rows: int, columns: int, fold: Fold) -> ModelPro
     network.graph.ClearField("value_info")
     graph = OnnxGraph(network)
     graph.infer_shapes()
+    graph.rewrite(JoinBranches())
     graph.rewrite(_sized)
     graph.rewrite(moved_behind)
     graph.save()

@@ -83,6 +83,12 @@ def test_operators_of_exporters_are_folded_and_compute_the_same(case: str) -> No
             y = ReduceSum<keepdims=0>(m, one_int)""",
             {"Conv": 2},
         ),
+        # Nothing replaces a Softmax of three branches.
+        (
+            """n = Unsqueeze(c, one_int) o = Unsqueeze(x, one_int) s = Concat<axis=1>(n, o, n)
+            p = Softmax<axis=1>(s) m = Mul(s, p) y = ReduceSum<keepdims=0>(m, one_int)""",
+            {"Conv": 1, "Unsqueeze": 2, "Concat": 1, "Softmax": 1, "Mul": 1, "ReduceSum": 1},
+        ),
     ],
 )
 def test_branches_with_an_axis_of_their_own_are_channels(

@@ -201,7 +201,7 @@ class Blocks(nn.Module):
 
 class Unshuffled(nn.Module):
     """A network that unshuffles the pixels of a colour image, as Real-ESRGAN does for twice the
-    sampling.
+    sampling, and adds the mean of its channels, as of several frames.
     """
 
     def __init__(self) -> None:
@@ -213,7 +213,8 @@ class Unshuffled(nn.Module):
         batch, channels, height, width = image.shape
         blocks = image.reshape(batch, channels, height // 2, 2, width // 2, 2)
         wide = blocks.permute(0, 1, 3, 5, 2, 4).reshape(batch, -1, height // 2, width // 2)
-        return functional.pixel_shuffle(self.body(wide), 2)
+        mean = image.reshape(batch, channels, 1, height, width).mean(1)
+        return mean + functional.pixel_shuffle(self.body(wide), 2)
 
 
 def exported(module: nn.Module, channels: int = 1) -> onnx.ModelProto:
