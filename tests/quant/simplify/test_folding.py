@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -98,9 +99,9 @@ def test_branches_with_an_axis_of_their_own_are_channels(
     others take the mean or maximum of stacked maps.
     """
     ends = "float[2,4,9,11] x => float[N,C,H,W] y"
-    axes = {"first_axis": [0], "last_axis": [-1]}
-    shares = np.reshape([0.3, 0.7], (1, 2, 1, 1, 1))
-    assert folded(network_from(f"{CONV} {nodes}", ends=ends, shares=shares, **axes)) == remaining
+    constants: dict[str, Any] = {"first_axis": [0], "last_axis": [-1]}
+    constants["shares"] = np.reshape([0.3, 0.7], (1, 2, 1, 1, 1))
+    assert folded(network_from(f"{CONV} {nodes}", ends=ends, **constants)) == remaining
 
 
 SWAP = "Transpose<perm=[1,0,2,3]>"
