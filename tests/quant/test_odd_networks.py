@@ -21,7 +21,7 @@ NUMBERS = {
     "six": 6.0,
     "twice": [1.0, 1.0, 2.0, 2.0],
     "ones": np.ones(36),
-    "one": [1],
+    "second_axis": [1],
     "split": [0, 4, 18, 2, 18, 2],
     "around": [0, 0, 1, 1, 0, 0, 1, 1],
     "joined": [0, 16, 18, 18],
@@ -279,7 +279,8 @@ REFUSED = {
     ),
     "without self-attention": sketch("c = Conv(in, c_w, c_b) out = MatMul(c, c)", c=(1, 1, 1, 1)),
     "Stack maps along the channels": sketch(
-        "c = Conv(in, c_w, c_b) deep = Unsqueeze(c, one) r = Exp(deep) out = Squeeze(r, one)",
+        """c = Conv(in, c_w, c_b) deep = Unsqueeze(c, second_axis) r = Exp(deep)
+        out = Squeeze(r, second_axis)""",
         c=(1, 1, 1, 1),
     ),
     "Concat rows must concatenate along the channels": sketch(
