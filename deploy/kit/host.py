@@ -390,28 +390,50 @@ def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
 
 
 def read_image(source: str) -> np.ndarray:
-    """Read an image (C, H, W) of at least a tile, or exit with the reason why it is refused."""
+    """Read an image (C, H, W) of at least a tile, or raise ValueError with the reason."""
     try:
-        image: np.ndarray = np.load(source).astype(F)
-    except (EOFError, OSError, ValueError) as error:
-        sys.exit(f"{source} cannot be read as an array of numbers: {error}")
+        with Path(source).open("rb") as file:
+            image: np.ndarray = np.lib.format.read_array(file).astype(F)
+    except (MemoryError, OSError, TypeError, ValueError) as error:
+        raise ValueError(f"{source} cannot be read as an array of numbers: {error}") from error
     t = S["tile_px"]
     whole = image.ndim == 3 and len(image) == S["channels"] and min(image.shape[1:]) >= t
     if not whole or not np.isfinite(image).all():
-        sys.exit(
+        raise ValueError(
             f"{source} must hold finite values ({S['channels']}, H, W) of at least {t} x {t} "
             f"pixels, got shape {image.shape}."
         )
     if np.median(image * np.array(S["input_factors"], F)[:, None, None]) > 1:
-        sys.exit(f"{source} is mostly above full scale. Divide its values by full scale.")
+        raise ValueError(f"{source} is mostly above full scale. Divide its values by full scale.")
     return image
+
+
+def require_output(path: Path, source: str) -> None:
+    """Raise ValueError if an output has no place, or would replace the image."""
+    if not path.parent.is_dir():
+        raise ValueError(f"{path} cannot be written: no such folder. Create it first.")
+    if path.is_dir() or (path.exists() and path.samefile(source)):
+        raise ValueError(f"{path} is the image or a folder. Choose another name for the result.")
+
+
+def save(target: Path, values: np.ndarray) -> None:
+    """Write an array, whole or not at all."""
+    part = target.with_name(f"{target.name}.part")
+    try:
+        with part.open("wb") as file:
+            np.save(file, values)
+        part.replace(target)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def main(source: str, target: str, runs: dict[float, Any], learn: bool) -> None:
     """Restore the image in `source` into `target`, tile by tile; `runs` has each factor's core."""
     image = read_image(source)
-    if not Path(target).parent.is_dir():
-        sys.exit(f"{target} cannot be written: no such folder. Create it first.")
+    output = Path(target)
+    check_output = output.with_name(f"{output.stem}-check.npy")
+    for path in (output, check_output):
+        require_output(path, source)
     t = S["tile_px"]
     r = S["scale"]
     wide = np.pad(image, [(0, 0)] + [(0, -n % S["alignment_px"]) for n in image.shape[1:]], "edge")
@@ -428,10 +450,10 @@ def main(source: str, target: str, runs: dict[float, Any], learn: bool) -> None:
     out = out[:, : image.shape[1] * r, : image.shape[2] * r]
     if S["consistency"]:
         out = np.stack([consistent(raw, np.clip(x, 0, F(1))) for raw, x in zip(image, out)])  # noqa: B905 - as above
-    np.save(target, out)
+    save(output, out)
     if S["self_check"]:
         blocks = np.stack([judged(raw, x) for raw, x in zip(image, out)])  # noqa: B905 - as above
-        np.save(Path(target).with_name(f"{Path(target).stem}-check.npy"), blocks)
+        save(check_output, blocks)
         sys.stdout.write(report(blocks))
     known_tile(runs, learn)
 
@@ -458,4 +480,8 @@ if __name__ == "__main__":
     parser.add_argument("restored", help=".npy to write")
     parser.add_argument("--learn", action="store_true", help="write known.json, on the board")
     words = parser.parse_args()
-    main(words.image, words.restored, cores(), words.learn)
+    try:
+        main(words.image, words.restored, cores(), words.learn)
+    except (OSError, ValueError) as error:
+        sys.stderr.write(f"host.py: {error}\n")
+        sys.exit(2)

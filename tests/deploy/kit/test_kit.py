@@ -188,21 +188,36 @@ def test_the_host_part_refuses_what_it_cannot_restore(
     """
     np.save(tmp_path / "image.npy", image)
     host = runpy.run_path(str(kit / "host.py"))
-    with pytest.raises(SystemExit, match=re.escape(words)) as caught:
+    with pytest.raises(ValueError, match=re.escape(words)) as caught:
         host["main"](tmp_path / "image.npy", tmp_path / "out.npy", {}, learn=False)
-    # Python prints this text alone, and exits with 1.
     assert str(caught.value).isprintable()
     assert not (tmp_path / "out.npy").exists()
 
 
-def test_the_host_part_refuses_a_folder_that_does_not_exist_before_the_run(
-    kit: Path, tmp_path: Path
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("none/out.npy", "no such folder"),
+        ("", "is the image or a folder"),
+        ("raw-check.npy", "is the image or a folder"),
+        # The figures of the self-check would replace it.
+        ("raw.npy", "is the image or a folder"),
+    ],
+)
+def test_the_host_part_refuses_an_output_before_the_run(
+    name: str, words: str, kit: Path, tmp_path: Path
 ) -> None:
-    np.save(tmp_path / "image.npy", np.full((1, 96, 96), 0.1, np.float32))
-    host = runpy.run_path(str(kit / "host.py"))
-    with pytest.raises(SystemExit, match=r"cannot be written: no such folder"):
-        # Without a core the run itself would fail.
-        host["main"](tmp_path / "image.npy", tmp_path / "none" / "out.npy", {}, learn=False)
+    """It has no place, or would replace the image; the script then exits with 2."""
+    image = tmp_path / "raw-check.npy"
+    np.save(image, np.full((1, 96, 96), 0.1, np.float32))
+    before = image.read_bytes()
+    command = [sys.executable, str(kit / "host.py"), str(image), str(tmp_path / name)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    assert ended.stderr.startswith("host.py: ")
+    assert words in ended.stderr
+    assert image.read_bytes() == before
+    assert len(list(tmp_path.iterdir())) == 1
 
 
 def facts(folder: Path) -> dict[str, Any]:
