@@ -1,9 +1,9 @@
 """Define reported figures: a number with its unit, mode and source; rows of them; and checks
 against a limit.
 
-A figure is measured (on this machine), predicted (by a model, with an interval) or published (in a
-named document). A figure that could not be determined is unavailable, with the reason. It is never
-reported as zero.
+A figure is measured (on this machine, or by the user on a board), predicted (by a model, with an
+interval) or published (in a named document). A figure that could not be determined is unavailable,
+with the reason. It is never reported as zero.
 """
 
 import math
@@ -77,7 +77,7 @@ class Figure:
 def measured(
     value: float, unit: str, source: str, interval: tuple[float, float] | None = None
 ) -> Figure:
-    """Build a figure that this run measured on this machine.
+    """Build a figure that was measured: by this run on this machine, or by the user on a board.
 
     The figure is unavailable if `value` is NaN or infinite. It has no interval if an end of
     `interval` is NaN or infinite.

@@ -59,9 +59,11 @@ Tables = list[tuple[str, list[Row]]]
 TRAFFIC = (
     "LdFM, StFM: feature maps loaded and stored, an image; LdWB: weights and biases loaded, a batch"
 )
-PREDICTED = (
-    "No board was used: the DPU's figures come from a cost model. Its power is not predictable "
-    "from public data: it is the range of what is published of the board, for any network."
+NO_BOARD = "No board was used: the DPU's figures come from a cost model."
+CORRECTED = "The DPU's figures come from a cost model, corrected by your runs on the board."
+POWER = (
+    "Its power is not predictable from public data: it is the range of what is published of the "
+    "board, for any network."
 )
 DETAILS = frozenset(
     {
@@ -253,7 +255,7 @@ def _table(
     return Bench(
         inputs=(network.input,),
         rows=tuple(rows),
-        notes=(*notes, PREDICTED),
+        notes=(*notes, f"{CORRECTED if boards[0].runs else NO_BOARD} {POWER}"),
         headings=headings,
         details=DETAILS,
         **more,

@@ -19,7 +19,7 @@ from beers_deploy.dpu.checker.placement import Placement, place
 from beers_deploy.dpu.cost.latency import Prediction, predict
 from beers_deploy.dpu.reading import read_sized_graph
 from beers_deploy.profiles.errors import OptionError, counted, printable
-from beers_deploy.profiles.figures import Row, predicted, published
+from beers_deploy.profiles.figures import Row, measured, predicted
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.profiles.user_files.json_text import read_json
@@ -111,7 +111,7 @@ class OwnRuns:
             before = run.predicted
             others = tuple(other.ratio for other in self.runs if other is not run)
             after = predict(run.placement, replace(before.dpu, runs=others))
-            figures = {"given": published(run.fps, "frame/s", self.source)}
+            figures = {"given": measured(run.fps, "frame/s", self.source)}
             for key, prediction in {"shipped": before, "by the other runs": after}.items():
                 off = 100 * (prediction.fps / run.fps - 1)
                 figures[key] = predicted(
@@ -119,7 +119,7 @@ class OwnRuns:
                 )
                 figures[f"{key} is off by"] = predicted(off, "%", (off, off), "arithmetic")
             if run.power_w is not None:
-                figures["power"] = published(run.power_w, "W", self.source)
+                figures["power"] = measured(run.power_w, "W", self.source)
             name = f"{run.name}, {before.dpu.target.name} {before.dpu.name}"
             rows.append(Row("runs", name, figures, {"bound": before.bound}))
         return rows

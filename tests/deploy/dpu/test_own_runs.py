@@ -100,6 +100,7 @@ def test_each_run_is_compared_with_its_prediction_from_the_others(folder: Path) 
     more = {"configuration": "C32B6", "power_w": 20}
     first, second = runs_of(folder, 0.5, {}, more).run_rows()
     assert second.figures["power"].value == 20
+    assert second.figures["power"].mode == second.figures["given"].mode == "measured"
     assert "power" not in first.figures
     for row in (first, second):
         before, after = (

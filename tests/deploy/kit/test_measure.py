@@ -77,6 +77,7 @@ def test_the_core_of_a_kit_is_measured_at_its_own_size(
     out.write_text(json.dumps([{**entry, "provider": "VitisAIExecutionProvider", "fps": 900.0}]))
     table = bd.bench("convbeers-half-xs-int8", tile=64, measured=out, size="700x600")
     assert any("your runs" in row.figures for row in table.rows)
+    assert "No board was used" not in table.notes[-1]
     assert run(monkeypatch, kit / "core.onnx", *provider, "--batch", 2) == 2
     # The rate of tiles of 64 px must not be recorded as that of 128 px.
     assert run(monkeypatch, kit / "core.onnx", *provider, "--tile", 128) == 2
