@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from beers_deploy.profiles.errors import one_line
+from beers_deploy.profiles.errors import OptionError, one_line, printable
 
 if TYPE_CHECKING:
     # Each command loads this module, also where it only prints its help.
@@ -61,7 +61,14 @@ def reporting(callback: Progress) -> Iterator[None]:
     Args:
         callback: a function that is called with each step, False for no report, True for a bar or
             plain lines. None leaves the setting of the surrounding block.
+
+    Raises:
+        OptionError: the callback is of another type.
     """
+    if callback is not None and not isinstance(callback, bool) and not callable(callback):
+        raise OptionError(
+            f"`progress` must be a function, False or None, got {printable(repr(callback))}."
+        )
     token = _sink.set(_sink.get() if callback is None else callback)
     try:
         yield

@@ -1,6 +1,9 @@
+from typing import Any, cast
+
 import pytest
 
 from beers_deploy.model.progress import Step, progress, reporting, step, steps
+from beers_deploy.profiles.errors import OptionError
 
 
 def test_progress_is_a_call_or_a_bar(
@@ -16,3 +19,5 @@ def test_progress_is_a_call_or_a_bar(
     with progress("making"):
         step("another")
     assert "restoring" in capsys.readouterr().err
+    with pytest.raises(OptionError, match="must be a function, False or None, got 'x'"):
+        reporting(cast(Any, "x")).__enter__()
