@@ -15,7 +15,8 @@ from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.training.patches import pair_files
-from beers_deploy.profiles.errors import ImageError
+from beers_deploy.pairs import Pair
+from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.instrument import MAX_DN, Instrument
 from beers_deploy.profiles.sensor import Sensor
 
@@ -177,6 +178,29 @@ def oversampling_note(pairs: Sequence[NamedPair], profile: Sensor) -> str:
         f"states {own}; at most {OVERSAMPLINGS[0]} are taken, and {OVERSAMPLINGS[1]} of small "
         "images ('simulate' keeps the profile's)."
     )
+
+
+def numbered_pairs(given: Iterable[Pair]) -> list[NamedPair]:
+    """Return pairs in memory, each named by its number.
+
+    Raises:
+        OptionError: there is none.
+        ImageError: a pixel is NaN or infinite, of which no score can be computed.
+    """
+    pairs = []
+    for number, pair in enumerate(given):
+        degraded, reference, clean = (
+            np.asarray(image, np.float32) for image in (*pair, pair.clean)
+        )
+        if not all(np.isfinite(image).all() for image in (degraded, reference, clean)):
+            raise ImageError(
+                f"Pair {number} of `pairs` has pixels that are NaN or infinite. Crop them off, or "
+                "leave the pair out."
+            )
+        pairs.append(NamedPair(f"pair{number}", degraded, reference, noise_free=clean))
+    if not pairs:
+        raise OptionError("There are no `pairs`. Give at least one.")
+    return pairs
 
 
 def read_pairs(

@@ -29,7 +29,7 @@ from beers_deploy.model.pairs_recipe import read_pairs_recipe
 from beers_deploy.model.raster.images import list_images
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.pairs import Pair
-from beers_deploy.profiles.errors import ImageError, OptionError, counted
+from beers_deploy.profiles.errors import ImageError, counted
 from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.untrusted import times
@@ -47,6 +47,7 @@ from beers_deploy.studies.evaluation.methods import (
 )
 from beers_deploy.studies.evaluation.pairs import (
     NamedPair,
+    numbered_pairs,
     pairs_of_scenes,
     read_pairs,
     table_at,
@@ -130,11 +131,7 @@ def run_evaluation(
     sensor_rows = list[Row]()
     loaded = list[NamedPair]()
     if given is not None:
-        for number, pair in enumerate(given):
-            degraded, reference = (image.astype(np.float32) for image in pair)
-            loaded.append(NamedPair(f"pair{number}", degraded, reference, noise_free=pair.clean))
-        if not loaded:
-            raise OptionError("There are no `pairs`. Give at least one.")
+        loaded = numbered_pairs(given)
     elif folder is not None:
         loaded = read_pairs(folder, nominal.max_dn, read_pairs_recipe(folder))
         sensor_rows = [_sensor_row(loaded, sensors[0], str(folder), strict)]

@@ -10,9 +10,11 @@ from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.model.simulator.acquire import simulate_pair
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.pairs import Pair
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.studies.evaluation.pairs import (
+    numbered_pairs,
     oversampling_note,
     oversamplings_of,
     read_pairs,
@@ -42,6 +44,15 @@ def test_a_pair_without_a_partner_or_of_two_sizes_is_refused(tmp_path: Path) -> 
     write_tiff(tmp_path / "reference" / "b.tif", np.ones((9, 9), np.uint16))
     with pytest.raises(ImageError, match=r"45 x 37 and 9 x 9"):
         read_pairs(tmp_path)
+
+
+def test_a_pair_in_memory_with_pixels_that_are_not_finite_is_refused() -> None:
+    """Its scores would be NaN, which a table shows as that of equal images."""
+    given = Pair(*np.zeros((3, 8, 8)), SENSORS[0], (DEGRADED, REFERENCE))
+    assert [each.name for each in numbered_pairs([given, given])] == ["pair0", "pair1"]
+    given.reference[0, 0] = np.nan
+    with pytest.raises(ImageError, match="Pair 0 of `pairs` has pixels that are NaN"):
+        numbered_pairs([given])
 
 
 def test_scenes_too_small_are_named_and_all_too_small_is_refused() -> None:
