@@ -70,12 +70,16 @@ def require_no_sidecar(path: Path) -> None:
     """Raise OptionError if a sidecar of an output (a mask, metadata, overviews or the place on
     Earth) exists already, which readers would apply to the new file.
     """
-    sidecars = [path.with_name(f"{path.name}{ending}") for ending in (".msk", ".aux.xml", ".ovr")]
-    # Documents have no world file: theirs would be that of an image of the same stem.
+    names = {f"{path.name}{ending}" for ending in (".msk", ".aux.xml", ".ovr")}
+    # The place of a document would be that of an image of the same stem.
     if path.suffix.lower() in OUT_SUFFIXES:
-        sidecars.append(path.with_suffix(".tfw"))
-    for sidecar in sidecars:
-        if sidecar.exists():
+        kind = path.suffix[1:]
+        places = (f".{kind[0]}{kind[-1]}w", f".{kind}w", ".wld", ".tab", ".rpb", "_rpc.txt")
+        names |= {f"{path.stem}{ending}" for ending in places}
+    # GDAL ignores the case of these names.
+    sought = {name.lower() for name in names}
+    for sidecar in sorted(path.parent.glob("*")):
+        if sidecar.name.lower() in sought:
             raise OptionError(
                 f"The sidecar {sidecar.name} exists already, and readers would apply it to the new "
                 "file. Remove it, or choose another name for the output."

@@ -120,7 +120,9 @@ def test_sidecar_files_of_gdal_count(model: Path, tmp_path: Path) -> None:
     with pytest.raises(ImageError, match="so that GDAL does not read it"):
         restored(image, model)
     (tmp_path / "in.tif.msk").unlink()
-    for sidecar in ("out.tif.msk", "out.tif.aux.xml", "out.tif.ovr", "out.tfw", "map.tif.aux.xml"):
+    of_files = ("out.tif.msk", "out.tif.aux.xml", "out.tif.ovr", "map.tif.aux.xml")
+    of_places = ("out.tfw", "out.tifw", "out.wld", "OUT.TAB", "out.RPB", "out_RPC.TXT")
+    for sidecar in (*of_files, *of_places):
         (tmp_path / sidecar).touch()
         with pytest.raises(OptionError, match=f"{sidecar} exists already"):
             restored(image, model, self_check=tmp_path / "map.tif")
