@@ -8,7 +8,6 @@ span the whole width and are spread evenly from top to bottom. In a large image 
 """
 
 import logging
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, pairwise
@@ -301,18 +300,24 @@ def figures(bands: Sequence[BandFaults]) -> Mapping[str, Figure]:
         where = f"band {number}: " if len(bands) > 1 else ""
         how = f"{band.checked_px} pixels in strips of the image"
         rms = f"rms over the level, without noise, {how}"
-        pattern = max((pattern.difference for pattern in band.patterns), default=math.nan)
         off = len(band.columns.off) + len(band.rows.off)
         dead = len(band.columns.dead) + len(band.rows.dead)
         result |= {
             f"{where}columns differ by": _spread(band.columns, rms),
             f"{where}rows differ by": _spread(band.rows, rms),
-            f"{where}2 x 2 pattern": measured(100 * pattern, "%", f"the strongest of three, {rms}"),
+            f"{where}2 x 2 pattern": _pattern(band, rms),
             f"{where}lines off": measured(off, "1", f"single columns and rows, {how}"),
             f"{where}dead lines": measured(dead, "1", f"columns and rows, {how}"),
             f"{where}wrong pixels": measured(len(band.pixels), "1", f"single ones, {how}"),
         }
     return result
+
+
+def _pattern(band: BandFaults, how: str) -> Figure:
+    if not band.patterns:
+        return unavailable("%", "too few pixels")
+    strongest = max(pattern.difference for pattern in band.patterns)
+    return measured(100 * strongest, "%", f"the strongest of three, {how}")
 
 
 def _spread(lines: Stripes, how: str) -> Figure:

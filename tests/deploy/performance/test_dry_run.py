@@ -116,6 +116,8 @@ def test_it_reads_none_of_a_file_of_ten_gigabytes(model: Path, tmp_path: Path) -
     done(f"restore {tmp_path}/big.tif --dry-run --network {model} --json {out}")
     (row,) = valid(out)["rows"]
     assert row["figures"]["width"]["value"] == 73_000
+    # No pixel of it has light.
+    assert row["figures"]["2 x 2 pattern"]["reason"] == "too few pixels"
     assert [entry["name"] for entry in valid(out)["inputs"]] == [model.name]
 
 
