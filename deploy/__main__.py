@@ -8,6 +8,8 @@ import traceback
 CRASHED = 70
 """The same as in `profiles.errors`. That module loads NumPy, which may be the library that does not
 load."""
+INTERRUPTED = 130
+"""The same as in `cli.run`, for Ctrl-C while libraries are loaded."""
 
 
 def main() -> None:
@@ -20,6 +22,8 @@ def main() -> None:
         from beers_deploy.cli.commands import app
 
         app(prog_name="beers-deploy")
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
     except Exception as error:  # noqa: BLE001 - Python itself would end with 1
         traceback.print_exc()
         print(  # noqa: T201
