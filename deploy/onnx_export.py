@@ -18,7 +18,7 @@ from beers_deploy.network_files import int8_for_sensor, warn_outside
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.profiles.user_files.whole import unreadable
+from beers_deploy.profiles.user_files.whole import read_whole, unreadable
 from beers_deploy.quant.c_code import c_program
 from beers_deploy.quant.encodings import (
     host_model,
@@ -35,6 +35,7 @@ from beers_deploy.quant.sensor_bank.conditioned import (
     required_conditioned_core,
     with_delta,
 )
+from beers_deploy.quant.untrusted import FILE_BYTES
 
 logger = logging.getLogger(__name__)
 
@@ -103,8 +104,8 @@ def conditioned_int8(path: Path, sensor: SensorLike | None, delta: Path | None) 
     model = load_onnx(path)
     if delta is not None:
         try:
-            packed = delta.read_bytes()
-        except OSError as error:
+            packed = read_whole(delta, FILE_BYTES)
+        except (OSError, ValueError) as error:
             raise ModelError(
                 f"The delta {delta} cannot be read: {unreadable(delta) or error}. Give a file that "
                 "'export --delta' wrote."

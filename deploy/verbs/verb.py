@@ -4,7 +4,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import wraps
 from inspect import Parameter, signature
@@ -15,7 +15,13 @@ from typing import Any, Literal, ParamSpec, TypeVar, cast, get_args, get_origin
 
 from annotated_types import Interval
 
-from beers_deploy.profiles.errors import BeersError, OptionError, missing_extra, printable
+from beers_deploy.profiles.errors import (
+    BeersError,
+    MachineError,
+    OptionError,
+    missing_extra,
+    printable,
+)
 from beers_deploy.verbs.parameters import Holds, InputPath, Labelled, NextTo, Wider, Written
 
 P = ParamSpec("P")
@@ -33,7 +39,8 @@ def verb(function: Callable[P, R]) -> Callable[P, R]:
        is an empty text, such as that of an unset variable.
     3. An output that is an input or another output is refused.
     4. The parameter `progress` decides how the work inside is reported.
-    5. If an optional package is missing, the error names the extra that installs it.
+    5. If an optional package is missing, the error names the extra that installs it. A path that
+       may not be read or written is named too.
     6. A table that is returned names the verb and its arguments.
     """
     parameters = signature(function).parameters
@@ -49,13 +56,8 @@ def verb(function: Callable[P, R]) -> Callable[P, R]:
         for name, value in bound.arguments.items():
             require_allowed(parameters[name], value)
         require_apart(function, bound.arguments)
-        try:
-            with reporting(bound.arguments.get("progress")):
-                result = function(*args, **kwargs)
-        except ImportError as error:
-            if isinstance(error, BeersError):
-                raise
-            raise missing_extra(error, function.__name__) from error
+        with _errors_of_machine(function.__name__), reporting(bound.arguments.get("progress")):
+            result = function(*args, **kwargs)
 
         def named(table: Table) -> Table:
             own = {**recorded(bound.arguments), **table.arguments}
@@ -70,6 +72,22 @@ def verb(function: Callable[P, R]) -> Callable[P, R]:
         return result
 
     return checked
+
+
+@contextmanager
+def _errors_of_machine(verb_name: str) -> Iterator[None]:
+    """Raise MachineError if a package is missing, or if a path may not be read or written."""
+    try:
+        yield
+    except ImportError as error:
+        if isinstance(error, BeersError):
+            raise
+        raise missing_extra(error, verb_name) from error
+    except PermissionError as error:
+        raise MachineError(
+            f"{printable(str(error.filename))} may not be read or written: {error.strerror}. "
+            "Change its permissions, or choose another path."
+        ) from error
 
 
 def require_allowed(parameter: Parameter, value: object) -> None:
@@ -171,8 +189,10 @@ def paths_of(function: Callable[..., Any], arguments: Mapping[str, Any]) -> Path
         if written is None:
             paths.inputs.extend(_paths_in(value))
             if is_path and marker(parameter, Labelled) is not None:
-                below = Path(value).rglob("*")
-                paths.inputs.extend(path for path in below if path.suffix.lower() in LABELS)
+                # Path.rglob would raise where a folder may not be entered.
+                for folder, _, names in os.walk(value):
+                    below = (Path(folder, each) for each in names)
+                    paths.inputs.extend(path for path in below if path.suffix.lower() in LABELS)
         # Anything else is refused afterwards, when older verdicts are deleted.
         elif is_path:
             # An output that is no folder is the file itself.
@@ -233,7 +253,8 @@ def _paths_in(value: Any) -> list[Path]:
             names.append(each)
     paths = [Path(name) for name in names if name != ""]
     roles = (path / role for path, role in product(paths, ("degraded", "reference")))
-    return [*paths, *filter(Path.is_dir, roles)]
+    # Path.is_dir would raise where a folder may not be entered.
+    return [*paths, *filter(os.path.isdir, roles)]
 
 
 LABELS = {".xml", ".txt"}

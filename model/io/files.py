@@ -92,8 +92,10 @@ def _require_apart(
     inputs.
     """
     sources = [path for path in inputs if path is not None]
-    files = [path for path in sources if not path.is_dir()]
-    for folder in filter(Path.is_dir, sources):
+    # Path.is_dir would raise where a folder may not be entered.
+    folders = list(filter(os.path.isdir, sources))
+    files = [path for path in sources if path not in folders]
+    for folder in folders:
         # The files in it that a command may read.
         files += [file for file in folder.glob("*") if file.suffix.lower() in READ_SUFFIXES]
     images = [file for file in files if file.suffix.lower() in IMAGE_SUFFIXES]

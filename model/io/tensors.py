@@ -84,7 +84,10 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
     Raises:
         ModelError: the file cannot be read, or is no safetensors file.
     """
+    fault = unreadable(path)
     try:
+        if fault is not None:
+            raise OSError(fault)
         with safe_open(path, framework="np") as file:
             header = {key: parse_json(value) for key, value in (file.metadata() or {}).items()}
             # Copies: the library's own lie in the file, which Windows then does not replace, and
@@ -92,7 +95,6 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
             return {key: np.array(file.get_tensor(key)) for key in file.keys()}, header  # noqa: SIM118 - no mapping
     except (SafetensorError, OSError, ValueError, LookupError, TypeError, RuntimeError) as error:
         name = printable(str(path))
-        fault = unreadable(path)
         other = None
         if fault is None:
             with suppress(OSError), path.open("rb") as stream:

@@ -1,7 +1,6 @@
 """Read whole files that a user names, and tell why a path cannot be read."""
 
 import stat
-from contextlib import suppress
 from pathlib import Path
 
 LFS_POINTER = b"version https://git-lfs"
@@ -35,14 +34,15 @@ def unreadable(path: Path) -> str | None:
     """
     try:
         mode = path.stat().st_mode
+        # Opening a pipe would wait for its other end.
+        if not stat.S_ISREG(mode):
+            return "it is a folder" if stat.S_ISDIR(mode) else "it is not a regular file"
+        with path.open("rb") as stream:
+            if stream.read(len(LFS_POINTER)) == LFS_POINTER:
+                return "it is a Git LFS pointer to the file, which 'git lfs pull' fetches"
     except FileNotFoundError:
         return "no such file"
-    # One reason is a name that is too long.
+    # One reason is a name that is too long, another that its user may not read it.
     except OSError as error:
         return error.strerror or str(error)
-    if not stat.S_ISREG(mode):
-        return "it is a folder" if stat.S_ISDIR(mode) else "it is not a regular file"
-    with suppress(OSError), path.open("rb") as stream:
-        if stream.read(len(LFS_POINTER)) == LFS_POINTER:
-            return "it is a Git LFS pointer to the file, which 'git lfs pull' fetches"
     return None

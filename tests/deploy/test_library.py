@@ -1,5 +1,6 @@
 """Test that arrays of NumPy, Dask and xarray are restored to the same pixels, or refused."""
 
+from errno import EACCES
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
-from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.errors import ImageError, MachineError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.verbs.restore import restore
+from beers_deploy.verbs.verb import verb
 from tests.deploy.restoration.runs import noise
 from tests.deploy.two_workers import local_cluster
 from tests.quant.tiling.small_networks import espcn
@@ -22,6 +24,17 @@ from tests.quant.tiling.small_networks import espcn
 @pytest.fixture(scope="module")
 def da() -> Any:
     return pytest.importorskip("dask.array", reason="the extra 'dask' is not installed")
+
+
+def test_a_path_that_may_not_be_read_is_one_sentence() -> None:
+    """An administrator may read every file, so that the error is raised here."""
+
+    @verb
+    def reading() -> None:
+        raise PermissionError(EACCES, "Permission denied", "a.tif")
+
+    with pytest.raises(MachineError, match=r"a\.tif may not be read or written: Permission"):
+        reading()
 
 
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])

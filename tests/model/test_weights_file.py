@@ -114,6 +114,13 @@ def test_a_missing_file_and_an_unknown_variant(tmp_path: Path) -> None:
         shipped_weights("convbeers-huge")
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names here")
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ModelError, match="it is not a regular file"):
+        read_tensors(tmp_path / "pipe")
+
+
 def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(MachineError, match="cannot be written"):

@@ -15,7 +15,7 @@ import numpy as np
 
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.profiles.errors import OptionError, counted
-from beers_deploy.profiles.user_files.whole import unreadable
+from beers_deploy.profiles.user_files.whole import read_whole, unreadable
 
 FOUND = "found"
 HEADER = ("column", "row", "band")
@@ -30,6 +30,8 @@ FAULT = re.compile(
 """A line with a fault: column and row, not both '*', and perhaps a band. No image has more than 9
 digits.
 """
+LIST_BYTES = 1 << 26
+"""The largest size of a list."""
 
 
 @dataclass(frozen=True, order=True)
@@ -139,8 +141,8 @@ def read_list(path: Path, raster: Raster) -> FaultList:
     reason = "lists none"
     lines = list[str]()
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError):
+        lines = read_whole(path, LIST_BYTES).decode("utf-8-sig").splitlines()
+    except (OSError, ValueError):
         reason = f"cannot be read: {unreadable(path) or 'it is not a text file'}"
     faults = set[Fault]()
     for number, line in enumerate(lines, 1):

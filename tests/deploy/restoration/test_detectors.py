@@ -1,5 +1,6 @@
 """Tests that faulty detectors are reported, listed, and replaced before the restoration."""
 
+import os
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
@@ -174,6 +175,13 @@ def test_a_list_that_does_not_fit_is_refused(tmp_path: Path, text: str | None, w
     with pytest.raises(OptionError) as error:
         read_list(path, Raster(3, 8, 10, np.dtype(np.uint16)))
     assert words in str(error.value)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names here")
+def test_a_pipe_is_no_list_and_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OptionError, match="it is not a regular file"):
+        read_list(tmp_path / "pipe", Raster(3, 8, 10, np.dtype(np.uint16)))
 
 
 def test_an_image_with_too_many_faulty_pixels_is_refused() -> None:
