@@ -14,6 +14,7 @@ import numpy as np
 from beers_deploy.model.io.files import write_text
 from beers_deploy.model.io.pictures import picture_url, stretch_of
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
+from beers_deploy.model.raster.facts import require_pixel_type
 from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.profiles.errors import ImageError, as_path
 from beers_deploy.profiles.instrument import Instrument
@@ -63,7 +64,7 @@ class Pair:
             The peak signal-to-noise ratio in dB; higher is more similar.
 
         Raises:
-            ImageError: the image has another shape.
+            ImageError: the image has another shape, or pixels that are no numbers.
         """
         return psnr_db(self._alike(image), self.reference, self.sensor.max_dn)
 
@@ -77,12 +78,14 @@ class Pair:
             The mean SSIM; 1 for equal images.
 
         Raises:
-            ImageError: the image has another shape, or is smaller than the window of 11 pixels.
+            ImageError: the image has another shape, pixels that are no numbers, or is smaller than
+                the window of 11 pixels.
         """
         return ssim(self._alike(image), self.reference, self.sensor.max_dn)
 
     def _alike(self, image: np.ndarray) -> np.ndarray:
         pixels = np.asarray(image)
+        require_pixel_type("`image`", pixels.dtype)
         if pixels.shape != self.reference.shape:
             raise ImageError(
                 f"`image` has the shape {pixels.shape}, but the reference has the shape "

@@ -211,6 +211,9 @@ def test_a_pair_in_memory_is_evaluated_as_one_of_files(pair: bd.Pair, tmp_path: 
     assert pair._repr_html_().count("<img") == 3
     assert repr(pair) == "Pair(70 x 70 px, pleiades-degraded -> pleiades-reference)"
     assert pair.ssim(pair.reference) == 1 > pair.ssim(pair.degraded) > 0
+    # NumPy would drop the imaginary part.
+    with pytest.raises(bd.BeersError, match="must have integer or float pixels, got complex128"):
+        pair.psnr(pair.reference * 1j)
     scene = np.full((700, 800), 90.0, np.float32)
     assert simulated(images=scene).degraded.shape == (76, 96)
     assert {row.name for row in bd.boards().rows} == set(board_names())
