@@ -48,7 +48,8 @@ def test_a_pair_without_a_partner_or_of_two_sizes_is_refused(tmp_path: Path) -> 
 
 def test_a_pair_in_memory_with_pixels_that_are_not_finite_is_refused() -> None:
     """Its scores would be NaN, which a table shows as that of equal images."""
-    given = Pair(*np.zeros((3, 8, 8)), SENSORS[0], (DEGRADED, REFERENCE))
+    degraded, reference, clean = np.zeros((3, 8, 8))
+    given = Pair(degraded, reference, clean, SENSORS[0], (DEGRADED, REFERENCE))
     assert [each.name for each in numbered_pairs([given, given])] == ["pair0", "pair1"]
     given.reference[0, 0] = np.nan
     with pytest.raises(ImageError, match="Pair 0 of `pairs` has pixels that are NaN"):
