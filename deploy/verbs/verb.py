@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from errno import EACCES, ELOOP, ENAMETOOLONG, EPERM
 from functools import wraps
 from inspect import Parameter, signature
 from itertools import product
@@ -27,6 +28,8 @@ from beers_deploy.verbs.parameters import Holds, InputPath, Labelled, NextTo, Wi
 P = ParamSpec("P")
 R = TypeVar("R")
 
+REFUSALS = (EACCES, ELOOP, ENAMETOOLONG, EPERM)
+"""Errors of the system for paths that the user can correct."""
 NOT_RECORDED = ("progress", "json", "junit")
 """Parameters that decide no figure."""
 
@@ -76,17 +79,19 @@ def verb(function: Callable[P, R]) -> Callable[P, R]:
 
 @contextmanager
 def _errors_of_machine(verb_name: str) -> Iterator[None]:
-    """Raise MachineError if a package is missing, or if a path may not be read or written."""
+    """Raise MachineError if a package is missing, or if the system refuses a path."""
     try:
         yield
     except ImportError as error:
         if isinstance(error, BeersError):
             raise
         raise missing_extra(error, verb_name) from error
-    except PermissionError as error:
+    except OSError as error:
+        if error.errno not in REFUSALS:
+            raise
         raise MachineError(
-            f"{printable(str(error.filename))} may not be read or written: {error.strerror}. "
-            "Change its permissions, or choose another path."
+            f"{printable(str(error.filename))} cannot be read or written: {error.strerror}. Change "
+            "its permissions, or choose another path."
         ) from error
 
 

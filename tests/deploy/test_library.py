@@ -33,7 +33,7 @@ def test_a_path_that_may_not_be_read_is_one_sentence() -> None:
     def reading() -> None:
         raise PermissionError(EACCES, "Permission denied", "a.tif")
 
-    with pytest.raises(MachineError, match=r"a\.tif may not be read or written: Permission"):
+    with pytest.raises(MachineError, match=r"a\.tif cannot be read or written: Permission"):
         reading()
 
 
