@@ -394,7 +394,8 @@ def read_image(source: str) -> np.ndarray:
     try:
         with Path(source).open("rb") as file:
             image: np.ndarray = np.lib.format.read_array(file).astype(F)
-    except (MemoryError, OSError, TypeError, ValueError) as error:
+    # The header of a damaged file may lead to anything.
+    except Exception as error:
         raise ValueError(f"{source} cannot be read as an array of numbers: {error}") from error
     t = S["tile_px"]
     whole = image.ndim == 3 and len(image) == S["channels"] and min(image.shape[1:]) >= t
@@ -423,6 +424,8 @@ def save(target: Path, values: np.ndarray) -> None:
         with part.open("wb") as file:
             np.save(file, values)
         part.replace(target)
+    except OSError as error:
+        raise ValueError(f"{target} cannot be written: {error}. Write elsewhere.") from error
     finally:
         part.unlink(missing_ok=True)
 
