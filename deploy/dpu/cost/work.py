@@ -3,8 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import chain
+from dataclasses import dataclass, replace
 
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.finding import groups_of
@@ -97,6 +96,7 @@ def count_work(operations: Sequence[Operation], dpu: Dpu) -> tuple[Work, ...]:
     Returns:
         One entry for each operation, except those of the kinds FUSED, which cost nothing.
     """
+    operations = _past_fused(operations)
     flow = _Flow(operations, dpu)
     return tuple(
         Work(
@@ -178,36 +178,26 @@ class _Flow:
         groups = dpu.value("memory", "feature_map_groups") / 2
         self._bank_bytes = dpu.value("memory", "feature_map_bytes") * groups
         self._lanes = dpu.input_parallel
-        self._same: dict[str, str] = {}
-        for op in operations:
-            if op.kind in FUSED:
-                self._same |= dict.fromkeys(op.outputs, self._root(op.inputs[0]))
-        computing = [op for op in operations if op.kind not in FUSED]
-        self._order: dict[str, int] = {}
-        self._reads: dict[str, set[str]] = {}
+        self._writers: dict[str, Operation] = {}
+        self._positions: dict[str, int] = {}
         self._readers = Counter[str]()
-        for position, op in enumerate(computing):
-            sources = [self._root(name) for name in op.inputs]
-            self._order |= dict.fromkeys(op.outputs, position)
-            self._reads |= {name: set(sources) for name in op.outputs}
-            self._readers.update(sources)
-        self._shapes = {op.output: op.out_shape for op in computing}
-        self._concats = {op.output for op in computing if op.kind == "concat"}
-        # The number of contiguous channels of a pixel, by result. A pixel shuffle at the end of a
-        # network is left to the host.
+        self._shapes: dict[str, Shape | None] = {}
+        # The number of contiguous channels of a pixel, by result.
         self._pieces: dict[str, int] = {}
-        for op in operations:
-            root = self._root(op.output)
-            if op.kind == "pixel shuffle" and op.in_shape and op.out_shape and self._readers[root]:
-                self._pieces[root] = min(op.in_shape[0], op.out_shape[0])
+        self._stored: set[str] = set()
+        for position, op in enumerate(operations):
+            if op.kind == "pixel shuffle" and op.in_shape and op.out_shape:
+                self._pieces[op.inputs[0]] = min(op.in_shape[0], op.out_shape[0])
             if op.kind == "concat":
                 fed = zip(op.inputs, op.in_shapes, strict=True)
-                self._pieces |= {self._root(name): shape[0] for name, shape in fed if shape}
-        inputs = chain.from_iterable(op.inputs for op in computing if op.kind == "concat")
-        self._stored = set(map(self._root, inputs))
-        self._sums = {
-            self._root(self._fused(op)): op.output for op in computing if op.kind in ("add", "mul")
-        }
+                self._pieces |= {name: shape[0] for name, shape in fed if shape}
+                self._stored.update(op.inputs)
+            if op.kind not in FUSED:
+                self._writers |= dict.fromkeys(op.outputs, op)
+                self._positions |= dict.fromkeys(op.outputs, position)
+                self._readers.update(op.inputs)
+                self._shapes[op.output] = op.out_shape
+        self._sums = {self._fused(op): op.output for op in operations if op.kind in ("add", "mul")}
 
     def serial(self, op: Operation) -> bool:
         """Return True if an operation adds or multiplies two maps that do not fit on the chip."""
@@ -231,12 +221,14 @@ class _Flow:
         # chip.
         if self.serial(op):
             return _size(op.out_shape)
-        here = set()
+        here = set[str]()
         if op.kind in ("add", "mul"):
-            fused = self._root(self._fused(op))
-            here = {fused, *self._reads.get(fused, ())}
-        fed = zip(map(self._root, op.inputs), op.in_shapes, strict=True)
-        return sum(_size(shape) for root, shape in fed if root not in here and self._leaves(root))
+            fused = self._fused(op)
+            here.add(fused)
+            if fused in self._writers:
+                here.update(self._writers[fused].inputs)
+        fed = zip(op.inputs, op.in_shapes, strict=True)
+        return sum(_size(shape) for name, shape in fed if name not in here and self._leaves(name))
 
     def store(self, op: Operation) -> int:
         """Return the bytes that an operation writes to memory.
@@ -245,35 +237,51 @@ class _Flow:
         """
         if op.kind in UNSTARTED:
             return 0
-        name = self._root(op.output)
+        name = op.output
         # A sum that is fused writes in place of the operation before it.
         while name in self._sums and self._readers[name] == 1:
             name = self._sums[name]
-        if self._readers[name] and name not in self._stored and not self._leaves(name):
-            return 0
         size = _size(op.out_shape)
+        # The host reads the network's result, and does the pixel shuffle at its end.
+        if not self._readers[name]:
+            return size
+        if name not in self._stored and not self._leaves(name):
+            return 0
         piece = self._pieces.get(name)
         # Pieces lie apart in memory: each takes whole bursts.
         return size // piece * up_to_multiple(piece, BURST_BYTES) if piece else size
 
     def _fused(self, add: Operation) -> str:
         """Return the operand of an add that is computed last."""
-        return max(add.inputs, key=lambda name: self._order.get(self._root(name), -1))
+        return max(add.inputs, key=lambda name: self._positions.get(name, -1))
 
-    def _leaves(self, root: str) -> bool:
-        outside = root not in self._order or root in self._concats
-        return outside or not self._fits(root) or self._readers[root] > SHARING
+    def _leaves(self, name: str) -> bool:
+        """Return True if a map passes through memory on its way to its readers."""
+        writer = self._writers.get(name)
+        outside = writer is None or writer.kind == "concat"
+        return outside or not self._fits(name) or self._readers[name] > SHARING
 
-    def _fits(self, root: str) -> bool:
-        shape = self._shapes.get(root)
+    def _fits(self, name: str) -> bool:
+        shape = self._shapes.get(name)
         # In the banks, channels are filled up to the number of lanes.
         return (
             shape is None
             or up_to_multiple(shape[0], self._lanes) * shape[1] * shape[2] <= self._bank_bytes
         )
 
-    def _root(self, name: str) -> str:
-        return self._same.get(name, name)
+
+def _past_fused(operations: Sequence[Operation]) -> list[Operation]:
+    """Return the operations with inputs that the operation before those of the kinds FUSED
+    writes.
+    """
+    origins: dict[str, str] = {}
+    resolved = []
+    for op in operations:
+        inputs = tuple(origins.get(name, name) for name in op.inputs)
+        resolved.append(replace(op, inputs=inputs))
+        if op.kind in FUSED:
+            origins |= dict.fromkeys(op.outputs, inputs[0])
+    return resolved
 
 
 def _size(shape: Shape | None) -> int:
