@@ -3,7 +3,7 @@ other and with the references.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,6 +42,19 @@ class Spread:
     counts: np.ndarray
     mae: np.ndarray
     largest: np.ndarray
+
+    @classmethod
+    def of(cls, differences: Sequence[np.ndarray]) -> "Spread":
+        """Summarise the differences (P,) of each of K patches, as shares of full scale."""
+        counts = np.zeros(2 * MAX_DN + 1, np.int64)
+        for difference in differences:
+            dn = np.rint(np.nan_to_num(difference).clip(-1, 1) * MAX_DN).astype(np.int64)
+            # Shifted by the largest digital number, because `bincount` counts from 0 on.
+            counts += np.bincount(dn + MAX_DN, minlength=len(counts))
+        sizes = [np.abs(difference) for difference in differences]
+        mae = np.array([float(size.mean()) for size in sizes])
+        largest = np.array([float(size.max()) for size in sizes])
+        return cls(counts, mae, largest)
 
     @property
     def std_dn(self) -> float:
@@ -184,27 +197,21 @@ def compare(
             size while others do.
         OptionError: the metric needs references of the size of the results.
     """
-    counts = np.zeros(BINS, np.int64)
-    dn_counts = np.zeros(2 * MAX_DN + 1, np.int64)
+    brightness = np.zeros(BINS, np.int64)
     differences = []
-    rows = []
-    errors = []
+    changes = []
+    contrasts = []
+    psnrs_db = []
     metric_values = []
     unfit = []
     for number, (degraded, reference) in enumerate(patches.pairs):
         in_float, in_int8, ranges = _results(float_session, int8_session, degraded, patches.ranges)
         degraded = to_shares(degraded, patches.ranges)
-        counts += histogram(degraded)
-        difference = (in_int8 - in_float).ravel()
-        differences.append(difference)
-        # Shifted by the largest digital number, because `bincount` counts from 0 on.
-        dn = np.rint(np.nan_to_num(difference).clip(-1, 1) * MAX_DN).astype(np.int64) + MAX_DN
-        dn_counts += np.bincount(dn, minlength=len(dn_counts))
+        brightness += histogram(degraded)
+        differences.append((in_int8 - in_float).ravel())
         same_shape = in_float.shape == degraded.shape
-        change = float(np.abs(in_float - degraded).mean()) if same_shape else math.nan
-        contrast = np.abs(in_float - in_float.mean()).mean()
-        sizes = np.abs(difference)
-        rows.append([float(sizes.mean()), float(sizes.max()), change, float(contrast)])
+        changes.append(float(np.abs(in_float - degraded).mean()) if same_shape else math.nan)
+        contrasts.append(float(np.abs(in_float - in_float.mean()).mean()))
         if reference.shape != in_float.shape:
             unfit.append(number)
         elif ranges or patches.ranges:
@@ -214,7 +221,7 @@ def compare(
                 f"The reference of {_name(patches, number)} must have values in [0, 1], but they "
                 f"are {reference.min():.4g} to {reference.max():.4g}. Divide it by full scale."
             )
-        errors.append(
+        psnrs_db.append(
             [
                 psnr_db(image, reference, 1.0) if image.shape == reference.shape else math.nan
                 for image in (degraded, in_float, in_int8)
@@ -222,12 +229,11 @@ def compare(
         )
         if metric:
             metric_values.append([metric_value(metric, r, reference) for r in (in_float, in_int8)])
-    if unfit and len(unfit) < len(errors):
+    if unfit and len(unfit) < len(differences):
         # A mean over some of them would be NaN, and its check left out.
         raise unfit_reference(patches, unfit[0], "the mean PSNR")
     everything = np.concatenate(differences).astype(np.float64)
-    maes, largest, changes, contrasts = np.array(rows).T
-    degraded_db, float_db, int8_db = np.mean(errors, axis=0).tolist()
+    degraded_db, float_db, int8_db = np.mean(psnrs_db, axis=0).tolist()
     metric_float, metric_int8 = np.mean(metric_values or [[math.nan] * 2], axis=0).tolist()
     return GateResult(
         mae=float(np.abs(everything).mean()),
@@ -238,16 +244,16 @@ def compare(
         psnr_degraded_db=degraded_db,
         psnr_float_db=float_db,
         psnr_int8_db=int8_db,
-        patches=len(errors),
+        patches=len(differences),
         simulated=bool(patches.views),
         metric=metric,
         metric_float=metric_float,
         metric_int8=metric_int8,
-        worst_drop_db=float(np.max([in_float - in_int8 for _, in_float, in_int8 in errors])),
-        input_change=float(changes.mean()),
-        contrast=float(contrasts.mean()),
-        sample_range=range_from(counts),
-        spread=Spread(dn_counts, maes, largest),
+        worst_drop_db=float(np.max([in_float - in_int8 for _, in_float, in_int8 in psnrs_db])),
+        input_change=float(np.mean(changes)),
+        contrast=float(np.mean(contrasts)),
+        sample_range=range_from(brightness),
+        spread=Spread.of(differences),
     )
 
 
