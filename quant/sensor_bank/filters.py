@@ -134,24 +134,8 @@ def integer_bank(bank: Bank, scale: int, gain: float, kernels: Kernels = "fitted
     outputs = channels(kernels)
     # Each further copy of a kernel makes up for the rounding errors of those before it.
     for kernel, _ in outputs:
-        values = (exact[kernel] + residual[kernel]).ravel()
-        # The image comes in its own steps, and from the coarse planes only.
-        coarse = np.rint(STEP_DN * values).astype(np.int64)
-        whole = parts = np.zeros_like(coarse)
-        if kernel:
-            coarse = shaped(STEP_DN * values)
-            # The last plane holds half of the remainder, so this grid is twice as fine.
-            fine = shaped(PART * values)
-            # Their sum is 0, so the number of odd weights is even.
-            odd = np.flatnonzero(fine % PART)
-            # One up, one down: the weights of each plane sum to 0, and flat ground gives 0.
-            parts[odd[::2]] = 1
-            parts[odd[1::2]] = -1
-            whole = (fine - parts) // PART
-        # The coarse plane comes twice, so a weight of twice int8's size fits.
-        half = coarse // 2
-        weight = np.stack([half, coarse - half, whole, parts])
-        weight = weight.reshape(BANK_SLICES.planes, *exact[kernel].shape)
+        weight = _on_planes((exact[kernel] + residual[kernel]).ravel(), is_image=kernel == 0)
+        weight = weight.reshape(-1, *exact[kernel].shape)
         weights.append(weight)
         # The two coarse planes carry nearly all of a number; the others only the remainder.
         residual[kernel] += exact[kernel] - (weight[0] + weight[1]) / STEP_DN
@@ -161,6 +145,28 @@ def integer_bank(bank: Bank, scale: int, gain: float, kernels: Kernels = "fitted
     return IntegerBank(
         np.concatenate(planes, 1).astype(np.int8), frac_bits, np.repeat(offsets, scale**2)
     )
+
+
+def _on_planes(values: Array, *, is_image: bool) -> NDArray[np.int64]:
+    """Round the weights (49,) of a filter to integer weights (4, 49) of the four planes."""
+    if is_image:
+        # The image comes in its own steps, and from the coarse planes only.
+        coarse = np.rint(STEP_DN * values).astype(np.int64)
+        fine = np.zeros_like(coarse)
+    else:
+        coarse = shaped(STEP_DN * values)
+        # The last plane holds half of the remainder, so this grid is twice as fine.
+        fine = shaped(PART * values)
+    # The sum of `fine` is 0, so the number of odd weights is even. One is rounded up, the next one
+    # down: the weights of each plane sum to 0, and flat ground gives 0.
+    odd = np.flatnonzero(fine % PART)
+    parts = np.zeros_like(fine)
+    parts[odd[::2]] = 1
+    parts[odd[1::2]] = -1
+    whole = (fine - parts) // PART
+    # The coarse plane comes twice, so a weight of twice int8's size fits.
+    half = coarse // 2
+    return np.stack([half, coarse - half, whole, parts])
 
 
 def shaped(values: Array) -> NDArray[np.int64]:
