@@ -195,14 +195,14 @@ def finetune(
     samples = list(_samples(core.host_part, full, tuning))
     # If there are too few samples to hold one out, all are used for both.
     held_out = (samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or samples)[:MOST_HELD_OUT]
-    training = [sample for k, sample in enumerate(samples) if (k + 1) % HELD_OUT_EVERY] or samples
-    rounds = (tuning.steps,) if tuning.steps else ROUNDS
-    most = f"{'' if tuning.steps else 'at most '}{sum(rounds)}"
-    trainable = TrainableCore(core)
-    generator = torch.Generator().manual_seed(tuning.seed)
+    training = [sample for number, sample in enumerate(samples, 1) if number % HELD_OUT_EVERY]
     # If a scale is too fine, the samples with the largest results clip first.
     order = sorted(training, key=lambda sample: float(sample.floats.abs().max()), reverse=True)
     judging = hardest_and_others(order, JUDGING)
+    rounds = (tuning.steps,) if tuning.steps else ROUNDS
+    most = f"{'' if tuning.steps else 'at most '}{sum(rounds)}"
+    generator = torch.Generator().manual_seed(tuning.seed)
+    trainable = TrainableCore(core)
     first = least = before = loss_of(core, held_out)
     done = 0
     paces = iter(PACES)
@@ -213,24 +213,19 @@ def finetune(
         trainable = with_better_scales(
             trainable, full, shifts, lambda candidate: loss_of(candidate, judging)
         )
-        # 3.
-        average = AveragedModel(trainable, avg_fn=_averaged)
-        for left in descend(trainable, training, steps, tuning.rate, pace, generator):
-            average.update_parameters(trainable)
-            # 4. Counted from the end, so that the last step is judged, where the rate is near 0.
-            if left % JUDGED_EVERY == 0 or left == steps:
-                candidate = cast(TrainableCore, average.module).core()
-                loss = loss_of(candidate, held_out)
-                if loss < least:
-                    core = candidate
-                    least = loss
-                if left == steps:
-                    # The gain of other scales says nothing about the pace.
-                    before = least
-                step(
-                    f"fine-tuning, step {done + steps - left} of {most}: held-out pairs lose "
-                    f"{least / max(first, LEAST_ERROR):.2f} of the first"
-                )
+        # 3. and 4.
+        for left, candidate in descend(trainable, training, steps, tuning.rate, pace, generator):
+            loss = loss_of(candidate, held_out)
+            if loss < least:
+                core = candidate
+                least = loss
+            if left == steps:
+                # The gain of other scales says nothing about the pace.
+                before = least
+            step(
+                f"fine-tuning, step {done + steps - left} of {most}: held-out pairs lose "
+                f"{least / max(first, LEAST_ERROR):.2f} of the first"
+            )
         done += steps
         # 5.
         if before - least < LEAST_GAIN * first:
@@ -249,8 +244,8 @@ def descend(
     highest_rate: float,
     pace: Pace,
     generator: torch.Generator,
-) -> Iterator[int]:
-    """Train the integers for one round by gradient descent with momentum.
+) -> Iterator[tuple[int, IntCore]]:
+    """Train the integers for one round by gradient descent with momentum, and average them.
 
     Gradients are divided by their running root mean square, as in Adam. The learning rate falls to
     0 as a half cosine. While it is high, parameters cross their rounding thresholds back and forth,
@@ -266,15 +261,23 @@ def descend(
         generator: the generator that draws the samples.
 
     Yields:
-        The number of steps that are left, before the first step and after each.
+        The number of steps that are left, and the rounded averages: before the first step, and each
+        time that a multiple of JUDGED_EVERY steps are left.
     """
+    average = AveragedModel(trainable, avg_fn=_averaged)
     parameters = list(trainable.parameters())
     means, mean_squares = ([torch.zeros_like(p) for p in parameters] for _ in range(2))
     # The number of samples follows from their size, so that a step costs about the same for any
     # size.
     count = max(BATCH_PIXELS // math.prod(samples[0].planes.shape[2:]), 1)
-    yield steps
-    for taken in range(steps):
+    for taken in range(steps + 1):
+        average.update_parameters(trainable)
+        left = steps - taken
+        # Counted from the end, so that the last step is judged, where the rate is near 0.
+        if left % JUDGED_EVERY == 0 or taken == 0:
+            yield left, cast(TrainableCore, average.module).core()
+        if left == 0:
+            return
         rate = highest_rate * pace.share * 0.5 * (1 + math.cos(math.pi * taken / steps))
         trainable.zero_grad()
         drawn = torch.randint(len(samples), (count,), generator=generator).tolist()
@@ -293,7 +296,6 @@ def descend(
             # smaller.
             move = mean / (1 - MOMENTUM ** (taken + 1)) / (root + 1e-15)
             parameter.data.sub_(rate * move)
-        yield steps - taken - 1
 
 
 def _averaged(average: Tensor, number: Tensor, count: Tensor | int) -> Tensor:
