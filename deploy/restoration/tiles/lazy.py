@@ -61,41 +61,41 @@ def restore_lazily(bands: Any, raster: Raster, pipeline: NetworkPipeline, readin
         )
         for band in range(len(networks))
     ]
-    shared = [delayed(restorer) for restorer in restorers]
-    reach_px = restorers[0].reach_px
     margin_px = restorers[0].margin_px
+    reach_px = restorers[0].reach_px
+    shared = [delayed(restorer) for restorer in restorers]
+    of_group = [shared[group % len(shared)] for group in range(plan.groups)]
     count = plan.tiling.channels_in
-
-    def read(place: TilePlace) -> Any:
-        """Return the lazy strip of a tile, which both of its tasks share."""
+    strips = {}
+    restored = {}
+    for place in chain.from_iterable(map(plan.places, plan.rows)):
         rows, columns = (
             slice(max(span.start - margin_px, 0), span.stop + margin_px) for span in place[1:]
         )
         pixels = bands[place.group * count : (place.group + 1) * count, rows, columns]
-        return delayed(_strip)(reading, of_group(place), pixels, rows.start, columns.start)
+        restorer = of_group[place.group]
+        # Both tasks of a tile share its strip.
+        strip = delayed(_strip)(reading, restorer, pixels, rows.start, columns.start)
+        strips[place] = strip
+        restored[place] = delayed(_tile)(restorer, strip, place)
 
-    def of_group(place: TilePlace) -> Any:
-        return shared[place.group % len(shared)]
-
-    places = list(chain.from_iterable(map(plan.places, plan.rows)))
-    strips = {place: read(place) for place in places}
-    restored = {place: delayed(_tile)(of_group(place), strips[place], place) for place in places}
-
-    def block(place: TilePlace) -> Any:
+    def chunk(place: TilePlace) -> Any:
+        """Return the finished pixels of a tile as a lazy array."""
         group, row, column = place
-        down = [tile for tile in plan.rows if _near(tile, row, reach_px)]
-        across = [tile for tile in plan.columns if _near(tile, column, reach_px)]
-        around = [
-            [restored[TilePlace(group, down_tile, tile)] for tile in across] for down_tile in down
+        near_rows = [span for span in plan.rows if _near(span, row, reach_px)]
+        near_columns = [span for span in plan.columns if _near(span, column, reach_px)]
+        near = [
+            [restored[TilePlace(group, near_row, span)] for span in near_columns]
+            for near_row in near_rows
         ]
-        at = down[0].keep_start, across[0].keep_start
-        finished = delayed(_finish)(of_group(place), strips[place], around, at, place)
+        at = near_rows[0].keep_start, near_columns[0].keep_start
+        finished = delayed(_finish)(of_group[group], strips[place], near, at, place)
         sides = ((span.keep_stop - span.keep_start) * plan.scale for span in (row, column))
         return da.from_delayed(finished, (plan.tiling.channels_out, *sides), raster.out_dtype)
 
     return da.block(
         [
-            [[block(TilePlace(g, row, column)) for column in plan.columns] for row in plan.rows]
+            [[chunk(TilePlace(g, row, column)) for column in plan.columns] for row in plan.rows]
             for g in range(plan.groups)
         ]
     )
