@@ -66,6 +66,22 @@ class EdgePixels:
     label: str
 
 
+class NearPixels(NamedTuple):
+    """The P pixels near an edge, which are fitted; (P,) each.
+
+    Attributes:
+        distance_px: the distance from the edge, negative on the left.
+        along_px: the row, relative to the middle.
+        values: the digital number.
+        variance: the variance of its noise.
+    """
+
+    distance_px: np.ndarray
+    along_px: np.ndarray
+    values: np.ndarray
+    variance: np.ndarray
+
+
 class EdgeLine(NamedTuple):
     """The line of an edge: x = place + slope * y + bow * (2 y / H)^2, from the middle of its H
     rows.
@@ -121,76 +137,77 @@ def fit_edge(
     Returns:
         The edge, or None if it leaves its pixels or has no step.
     """
-    edges, lines = responses()
-    edge_table = edges @ weights
-    line_table = lines @ weights
-    height = pixels.values.shape[0]
     levels = None
-    texture = 0.0
     fitted = None
     for _ in range(passes):
-        distance_px, along_px, values, variance = _near(pixels, line)
-        left = distance_px < -2
-        right = distance_px > 2
+        near = _near(pixels, line)
+        left = near.distance_px < -2
+        right = near.distance_px > 2
         if min(left.sum(), right.sum()) < 4 * HALF_PX:
             return None
         if levels is None:
-            levels = np.array([np.median(values[left]), 0, 0, np.median(values[right]), 0, 0])
-        step = levels[3] - levels[0]
-        if step == 0:
+            on_left, on_right = (np.median(near.values[side]) for side in (left, right))
+            levels = np.array([on_left, 0, 0, on_right, 0, 0])
+        if levels[0] == levels[3]:
             return None
-        ones = np.ones_like(along_px)
-        # The derivatives of each pixel by the three parameters of a plane.
-        plane = np.stack([ones, 2 * along_px / height, distance_px / HALF_PX], axis=1)
-        share = at_distances(edge_table, distance_px)[:, None]
-        by_levels = np.hstack([plane * (1 - share), plane * share])
-        rest = values - by_levels @ levels
-        scale = max(robust_deviation(rest), 1e-9)
-        # Cars, branches and drains lie next to edges, so pixels with large residuals count less.
-        huber = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(rest), 1e-9))
-        # A residual beyond the noise is texture, which lowers the weight of the edge.
-        texture = max(float(np.average(rest**2, weights=huber)) - float(variance.mean()), 0.0)
-        pixel_weights = np.sqrt(huber / (variance + texture))
-        rise = plane @ (levels[3:] - levels[:3])
-        # The derivatives of each pixel by place, slope and bow of the line.
-        slope = rise * at_distances(line_table, distance_px)
-        by_place = -slope / math.hypot(1, line.slope)
-        by_line = np.stack(
-            [by_place, by_place * along_px, by_place * (2 * along_px / height) ** 2], axis=1
-        )
-        expected, expected_rest = _expectations(levels, line, step)
-        normal = np.vstack([np.hstack([by_levels, by_line]) * pixel_weights[:, None], expected])
-        curve = np.vstack(
-            [
-                (rise * pixel_weights)[:, None] * at_distances(edges, distance_px),
-                np.zeros((NUMBERS, PARTS)),
-            ]
-        )
-        weighted_rest = np.concatenate([rest * pixel_weights, expected_rest])
-        strip = np.floor((along_px + height / 2) / STRIP_PX).astype(int)
-        unevenness = math.sqrt(texture) / abs(step)
-        fitted = FittedEdge(
-            pixels,
-            line,
-            abs(step),
-            unevenness,
-            normal,
-            curve,
-            weighted_rest,
-            strip,
-        )
-        change = np.linalg.lstsq(normal, weighted_rest, rcond=None)[0]
+        fitted = _linearised(pixels, near, line, levels, weights)
+        change = np.linalg.lstsq(fitted.normal, fitted.rest, rcond=None)[0]
         levels = levels + change[:LEVELS]
         numbers = np.array(line) + np.clip(change[LEVELS:], -MAX_STEP, MAX_STEP)
         line = EdgeLine(*numbers.tolist())
     return fitted
 
 
-def _near(pixels: EdgePixels, line: EdgeLine) -> tuple[np.ndarray, ...]:
-    """Return the pixels within HALF_PX of the line on both sides: the signed distance of each from
-    the edge, negative on the left; its row, relative to the middle; its value; and the variance of
-    its noise, (P,) each.
+def _linearised(
+    pixels: EdgePixels, near: NearPixels, line: EdgeLine, levels: np.ndarray, weights: np.ndarray
+) -> FittedEdge:
+    """Return an edge with the equations of one pass of Gauss-Newton.
+
+    Args:
+        pixels: the pixels around the edge.
+        near: those that are fitted.
+        line: the current line.
+        levels: (6,) the current parameters of the left plane, then of the right one.
+        weights: (PARTS,) of the curve.
     """
+    edges, lines = responses()
+    height = pixels.values.shape[0]
+    step = levels[3] - levels[0]
+    ones = np.ones_like(near.along_px)
+    # The derivatives of each pixel by the three parameters of a plane.
+    plane = np.stack([ones, 2 * near.along_px / height, near.distance_px / HALF_PX], axis=1)
+    share = at_distances(edges @ weights, near.distance_px)[:, None]
+    by_levels = np.hstack([plane * (1 - share), plane * share])
+    rest = near.values - by_levels @ levels
+    scale = max(robust_deviation(rest), 1e-9)
+    # Cars, branches and drains lie next to edges, so pixels with large residuals count less.
+    huber = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(rest), 1e-9))
+    # A residual beyond the noise is texture, which lowers the weight of the edge.
+    texture = max(float(np.average(rest**2, weights=huber)) - float(near.variance.mean()), 0.0)
+    pixel_weights = np.sqrt(huber / (near.variance + texture))
+    rise = plane @ (levels[3:] - levels[:3])
+    # The derivatives of each pixel by place, slope and bow of the line.
+    slope = rise * at_distances(lines @ weights, near.distance_px)
+    by_place = -slope / math.hypot(1, line.slope)
+    by_line = np.stack(
+        [by_place, by_place * near.along_px, by_place * (2 * near.along_px / height) ** 2], axis=1
+    )
+    by_curve = (rise * pixel_weights)[:, None] * at_distances(edges, near.distance_px)
+    expected, expected_rest = _expectations(levels, line, step)
+    return FittedEdge(
+        pixels=pixels,
+        line=line,
+        step=abs(step),
+        unevenness=math.sqrt(texture) / abs(step),
+        normal=np.vstack([np.hstack([by_levels, by_line]) * pixel_weights[:, None], expected]),
+        curve=np.vstack([by_curve, np.zeros((NUMBERS, PARTS))]),
+        rest=np.concatenate([rest * pixel_weights, expected_rest]),
+        strip=np.floor((near.along_px + height / 2) / STRIP_PX).astype(int),
+    )
+
+
+def _near(pixels: EdgePixels, line: EdgeLine) -> NearPixels:
+    """Return the pixels within HALF_PX of the line on both sides."""
     height, width = pixels.values.shape
     y, x = np.mgrid[:height, :width].astype(np.float64)
     y -= (height - 1) / 2
@@ -198,7 +215,7 @@ def _near(pixels: EdgePixels, line: EdgeLine) -> tuple[np.ndarray, ...]:
     across = x - line.place_px - line.slope * y - line.bow_px * (2 * y / height) ** 2
     distance_px = across / math.hypot(1, line.slope)
     near = np.abs(distance_px) <= HALF_PX
-    return distance_px[near], y[near], pixels.values[near], pixels.variance[near]
+    return NearPixels(distance_px[near], y[near], pixels.values[near], pixels.variance[near])
 
 
 def _expectations(levels: np.ndarray, line: EdgeLine, step: float) -> tuple[np.ndarray, np.ndarray]:
