@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from onnx import TensorProto, helper
+from onnxruntime import InferenceSession
 
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.quant.core import IntConv, IntCore, dequantized, rounded_to
@@ -142,15 +143,7 @@ def layer_errors(
 
     float_session = open_session(graph_to_onnx((*graph, *twins), names, width))
     int8_session = open_session(host_model(core, {}))
-    # The float network from each of its tensors on, an input next to the planes.
-    rests = {}
-    for name in set(tensors(graph)) - {CORRECTION}:
-        behind = tuple(op for op in graph if op.output != name)
-        model = graph_to_onnx(behind, [CORRECTION], width)
-        model.graph.input.append(
-            helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", "C", None, None])
-        )
-        rests[name] = open_session(model)
+    rests = {name: _rest_after(name, graph, width) for name in set(tensors(graph)) - {CORRECTION}}
     layers = [LayerError(op.name, Loss(), Loss()) for op in graph]
     together = Loss()
     scale = core.scale(CORRECTION)
@@ -183,6 +176,16 @@ def layer_errors(
             layer.network.add(to_shares(image, ranges), restored, offset)
         together.add(to_shares(result_of(int8_session, crop), ranges), restored, offset)
     return layers, together
+
+
+def _rest_after(name: str, graph: Graph, planes: int) -> InferenceSession:
+    """Open the part of a float network behind a tensor, which is an input next to the planes."""
+    behind = tuple(op for op in graph if op.output != name)
+    model = graph_to_onnx(behind, [CORRECTION], planes)
+    model.graph.input.append(
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", "C", None, None])
+    )
+    return open_session(model)
 
 
 def _in_int8(core: IntCore, op: Op, exact: Mapping[str, np.ndarray]) -> np.ndarray:
