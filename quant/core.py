@@ -309,17 +309,17 @@ def _quantize_conv(op: Conv, input_bits: int, output_bits: int, shifts: Shifts) 
     ends_first = op.ceiling is not None or INT8_MAX * 2.0**-output_bits <= SIX
     is_relu = op.activation is Activation.relu6 and ends_first
     rounded = IntConv(
-        op.name,
-        op.input,
-        op.output,
-        quantize(op.weight, weight_frac_bits),
-        weight_frac_bits,
-        bias,
-        bias_frac_bits,
-        Activation.relu if is_relu else op.activation,
-        op.window,
-        op.groups,
-        op.transposed,
+        name=op.name,
+        input=op.input,
+        output=op.output,
+        weight=quantize(op.weight, weight_frac_bits),
+        weight_frac_bits=weight_frac_bits,
+        bias=bias,
+        bias_frac_bits=bias_frac_bits,
+        activation=Activation.relu if is_relu else op.activation,
+        window=op.window,
+        groups=op.groups,
+        transposed=op.transposed,
     )
     return RoundedConv(op, rounded, output_bits)
 

@@ -147,7 +147,6 @@ class BoardWriter(GraphWriter):
         """
         if isinstance(op, IntConv):
             weight = onnx_weight(op.weight, op.transposed)
-            kind = (op.activation, op.window, op.groups, op.transposed)
             numbers = {
                 "weight": (weight, op.weight_frac_bits),
                 "bias": (op.bias, op.bias_frac_bits),
@@ -157,7 +156,17 @@ class BoardWriter(GraphWriter):
                 name = f"{op.name}.{role}"
                 integers = [self.constant(name, value), *self.scale(name, frac_bits)]
                 feeds.append(self.node("DequantizeLinear", f"{name}.float", integers))
-            op = Conv(op.name, op.input, op.output, op.weight, op.bias, *kind)
+            op = Conv(
+                op.name,
+                op.input,
+                op.output,
+                op.weight,
+                op.bias,
+                activation=op.activation,
+                window=op.window,
+                groups=op.groups,
+                transposed=op.transposed,
+            )
         write_float(self, op, feeds, output)
 
 
@@ -256,10 +265,16 @@ def save_config(core: Path, device: str) -> Path:
         device: the name of the device in AMD's words. All other settings are the same for every
             network.
     """
-    names = ("init", "vaiml_partition")
-    vaiml = {"device": device, "optimize_level": 2}
-    first, second = ({"name": name, "plugin": f"vaip-pass_{name}"} for name in names)
-    passes = [first, {**second, "vaiml_config": vaiml}]
-    config = {"passes": passes, "target": "VAIML", "targets": [{"name": "VAIML", "pass": [*names]}]}
+    settings = {"device": device, "optimize_level": 2}
+    passes = [
+        {"name": "init", "plugin": "vaip-pass_init"},
+        {
+            "name": "vaiml_partition",
+            "plugin": "vaip-pass_vaiml_partition",
+            "vaiml_config": settings,
+        },
+    ]
+    target = {"name": "VAIML", "pass": ["init", "vaiml_partition"]}
+    config = {"passes": passes, "target": "VAIML", "targets": [target]}
     write_text(core.with_name(CONFIG), json.dumps(config, indent=1) + "\n")
     return core.with_name(CONFIG)

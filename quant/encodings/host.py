@@ -111,18 +111,17 @@ def part_model(core: IntCore, start: int, stop: int) -> ModelProto:
     for op in part:
         _WRITERS[type(op)](writer, core, op)
     written = {op.output for op in part}
-    reads = dict.fromkeys(chain.from_iterable(op.inputs for op in part))
-    ends = [
+    names_read = dict.fromkeys(chain.from_iterable(op.inputs for op in part))
+    read = [name for name in names_read if name not in written]
+    returned = [name for name in live_tensors(core, stop) if name in written]
+    inputs, outputs = (
         [
             helper.make_tensor_value_info(name, TensorProto.UINT8, ["N", None, None, None])
             for name in names
         ]
-        for names in (
-            [name for name in reads if name not in written],
-            [name for name in live_tensors(core, stop) if name in written],
-        )
-    ]
-    return make_model(writer.graph("part", *ends), {}, microsoft=True)
+        for names in (read, returned)
+    )
+    return make_model(writer.graph("part", inputs, outputs), {}, microsoft=True)
 
 
 def live_tensors(core: IntCore, at: int) -> list[str]:
