@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from itertools import chain, groupby, product
 from pathlib import Path
@@ -60,11 +60,11 @@ class DatasetRecipe:
         scene_scale: a factor on the size of every scene, if the wanted ratio is not an integer.
     """
 
-    scenes: tuple[Path | None, ...]  # None stands for a drawn scene.
+    scenes: tuple[Path | None, ...]
     degraded: Sensor
     reference: Sensor
     oversampling: int
-    patch_px: int | None  # None leaves each scene whole.
+    patch_px: int | None
     radiance_scale: float = 1.0
     seed: int = 0
     tolerance_dn: float = TOLERANCE_DN
@@ -247,14 +247,15 @@ def write_dataset(
     manifest = out / "manifest.jsonl"
     parts = {out / "parts" / f"{chunk[0].number:08d}.jsonl": chunk for chunk in _chunks(windows)}
     lines = _lines_left(recipe, out, windows, parts) if resume else {}
-    waiting = {path: [w for w in chunk if w.number not in lines] for path, chunk in parts.items()}
-    waiting = {path: chunk for path, chunk in waiting.items() if chunk}
-    with ExitStack() as stack:
-        bar = stack.enter_context(steps("simulating", len(windows)))
+    waiting = {}
+    for path, chunk in parts.items():
+        missing = [window for window in chunk if window.number not in lines]
+        if missing:
+            waiting[path] = missing
+    executor = _executor(pool, workers, len(waiting))
+    with steps("simulating", len(windows)) as bar, executor as calls:
         bar.advance(len(lines))
-        if pool is None and workers > 1 and len(waiting) > 1:
-            pool = stack.enter_context(processes(min(workers, MOST_PROCESSES)))
-        for path, patches in _patches_by_path(recipe, waiting, workers, pool):
+        for path, patches in _patches_by_path(recipe, waiting, workers, calls):
             for window, patch in zip(waiting[path], patches, strict=True):
                 for role, dn in patch.images.items():
                     write_tiff(image_of(out, role, window.name), dn)
@@ -270,6 +271,15 @@ def write_dataset(
         line = json.loads(text)
         rejected += sum(line[role]["rejected_snr_pairs"] for role in ROLES)
     return {"patches": len(lines), "rejected_share": rejected / (rejected + 2 * len(lines))}
+
+
+def _executor(
+    pool: Executor | None, workers: int, calls: int
+) -> AbstractContextManager[Executor | None]:
+    """Return the given pool, or new processes if there are several calls; None to call here."""
+    if pool is None and workers > 1 and calls > 1:
+        return processes(min(workers, MOST_PROCESSES))
+    return nullcontext(pool)
 
 
 @contextmanager

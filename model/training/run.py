@@ -121,9 +121,17 @@ def train(run: Run, resume: bool, worker: Worker) -> None:
         logger.info(message)
     generator = torch.Generator().manual_seed(run.recipe.seed)
     start = grow(_given(run, run.start), variant, generator) if run.start else None
-    conditioned = run.patches.family is not None
-    options = (run.device, start, run.precision, conditioned, run.rounding)
-    trainer = Trainer(variant, run.recipe, loss, worker, *options)
+    trainer = Trainer(
+        variant,
+        run.recipe,
+        loss,
+        worker,
+        device=run.device,
+        start=start,
+        precision=run.precision,
+        conditioned=run.patches.family is not None,
+        rounding=run.rounding,
+    )
     if loss.perceptual is not None:
         loss.perceptual.to(trainer.device)
     trainer.data = data_sha256(run, loss)
@@ -177,9 +185,8 @@ def loss_of(run: Run) -> tuple[RestorationLoss, str]:
         return RestorationLoss(run.recipe.loss), ""
     backbone = find_backbone("squeeze", run.lpips)
     if backbone is None:
-        return RestorationLoss(
-            run.recipe.loss
-        ), f"trains WITHOUT the LPIPS term: {not_found('squeeze')}"
+        message = f"trains WITHOUT the LPIPS term: {not_found('squeeze')}"
+        return RestorationLoss(run.recipe.loss), message
     perceptual = Lpips.load("squeeze", backbone)
     return RestorationLoss(run.recipe.loss, perceptual), f"LPIPS term over {backbone.name}"
 
@@ -222,12 +229,18 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
     """
     recipe = run.recipe
     worker = trainer.worker
-    ranks = worker.rank, worker.count
     sensors = (run.patches.family or run.patches.degraded, run.patches.reference)
     if run.pairs is not None:
         files = pair_files(run.pairs)
-        sizes = run.patches.patch_px, recipe.batch
-        source = StoredPairs(files, run.patches.degraded, *sizes, recipe.seed, *ranks)
+        source = StoredPairs(
+            files,
+            run.patches.degraded,
+            run.patches.patch_px,
+            recipe.batch,
+            recipe.seed,
+            worker.rank,
+            worker.count,
+        )
         return source.batches, Validation([], *sensors), [degraded.name for degraded, _ in files]
     images = image_files(run)
     # The split may be refused, so it comes before the images are read.
@@ -245,7 +258,15 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
             "No image is left to train on. Give `images`, `pairs` or `drawn`, or hold out fewer "
             "sites."
         )
-    patches = PatchSource(train_on, run.patches, recipe.batch, recipe.seed, *ranks, trainer.device)
+    patches = PatchSource(
+        train_on,
+        run.patches,
+        recipe.batch,
+        recipe.seed,
+        worker.rank,
+        worker.count,
+        trainer.device,
+    )
     if patches.unused and worker.first:
         logger.warning(
             "%d of the %d training images are too small for a patch of %d px and are not used, "
@@ -265,9 +286,9 @@ def image_files(run: Run) -> list[Path]:
 
 def read_scenes(files: Sequence[Path], reference: Sensor) -> list[Scene]:
     """Read images as scenes of the reference sensor."""
-    scenes = list[Scene]()
     if not files:
         return []
+    scenes = []
     with steps("reading", len(files)) as bar:
         for file in files:
             scenes.append(read_scene(file, reference.nominal()))

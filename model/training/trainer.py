@@ -195,9 +195,15 @@ class Trainer:
         several = self.worker.count > 1
         # Gradients are averaged over the workers.
         forward: nn.Module = DistributedDataParallel(self.network) if several else self.network
-        agree = largest_of_all if several else None
-        options = (recipe.gradient_norm, precision == "bfloat16", rounding, agree)
-        self._take = Step(self.network, self.loss, forward, *options)
+        self._take = Step(
+            self.network,
+            self.loss,
+            forward,
+            gradient_norm=recipe.gradient_norm,
+            bfloat16=precision == "bfloat16",
+            rounding=rounding,
+            agree=largest_of_all if several else None,
+        )
         self.average = self._take.average
         self.optimiser = self._take.optimiser
         self._unseen = list[Tensor]()
