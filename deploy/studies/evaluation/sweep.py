@@ -137,20 +137,21 @@ def run_sweep(
     loaded = scenes_at(brightness, load_scenes(images, aim, seed))
     # Reversed, so that the first scene of each site is the one that stays.
     scenes = {site_of(scene.name): scene for scene in reversed(loaded)}
-    candidates = [method_named(name, profile, reference) for name in (DEGRADED, TRADITIONAL)]
-    candidates += [method for method in methods if method.name not in WITHOUT_NETWORK]
     sensors = conditions(nominal, profile)
+    pipeline = method_named(TRADITIONAL, profile, reference)
+    networks = [method for method in methods if method.name not in WITHOUT_NETWORK]
+    candidates = [method_named(DEGRADED, profile, reference), pipeline, *networks]
     able = [method for method in candidates if method.specialise is not None]
     wrongly = suppositions(nominal, profile)
-    trials = dict[str, list[tuple[str, Instrument, Method]]]()
+    trials = dict[str, list[Trial]]()
     for name, sensor in sensors.items():
-        trials[name] = [(name, sensor, method) for method in candidates]
+        trials[name] = [Trial(name, sensor, method) for method in candidates]
         # Under the nominal condition this trial of the pipeline is the plain one.
         if name != NOMINAL:
             units = replace(nominal, gain_dn_per_radiance=sensor.gain_dn_per_radiance)
-            trials[name].append((NOMINAL, units, candidates[1]))
-        others = wrongly.get(name, {}).items()
-        trials[name] += [(*known, method) for known, method in product(others, able)]
+            trials[name].append(Trial(NOMINAL, units, pipeline))
+        for supposed, other in wrongly.get(name, {}).items():
+            trials[name] += [Trial(supposed, other, method) for method in able]
     with steps("sweep", sum(map(len, trials.values()))) as bar:
         for name, sensor in sensors.items():
             pairs, _ = simulate_pairs(
@@ -158,14 +159,28 @@ def run_sweep(
             )
             # Edges do not depend on the brightness of the scenes: they are measured at 1 alone.
             edges = acquire_edges(sensor, seed) if brightness == 1 else []
-            for supposed, other, method in trials[name]:
+            for supposed, assumed, method in trials[name]:
                 key = Key(name, supposed, method.name)
-                specialised = method.with_sensor(other)
+                specialised = method.with_sensor(assumed)
                 psnr[key] = _psnr_db(specialised, pairs, sensor.max_dn)
                 if brightness == 1 and supposed in (name, NOMINAL):
                     mtf[key] = restored_mtf(specialised, edges, sensor.max_dn)
                 bar.advance(1, f"{name}: {method.name}")
     return SweepResult(psnr, mtf, [pair.site for pair in pairs], seed, brightness)
+
+
+class Trial(NamedTuple):
+    """A method, and the sensor that it assumes.
+
+    Attributes:
+        supposed: the name of the sensor.
+        sensor: the sensor.
+        method: the method.
+    """
+
+    supposed: str
+    sensor: Instrument
+    method: Method
 
 
 def _psnr_db(method: Method, pairs: Sequence[NamedPair], max_dn: int) -> np.ndarray:
