@@ -138,9 +138,15 @@ class SensorFamily:
         sigma_dark = sigma * _log_uniform(generator, 0.5, 1.0)
         alpha = max(sigma**2 - sigma_dark**2, 0.0) / (full_scale * 3 / 16)
         beta = max(sigma_dark**2 - alpha * full_scale / 16, 0.0)
-        gain = self.like.gain_dn_per_radiance
-        bits = self.like.bits
-        instrument = Instrument(mtf, alpha, beta, gain, bits, {}, along, full_scale / 4)
+        instrument = Instrument(
+            mtf_nyquist=mtf,
+            alpha=alpha,
+            beta=beta,
+            gain_dn_per_radiance=self.like.gain_dn_per_radiance,
+            bits=self.like.bits,
+            mtf_nyquist_along=along,
+            radiance_1=full_scale / 4,
+        )
         if self.other_curves and generator.random() < self.other_curves:
             return replace(instrument, response=draw_table(mtf, along, generator))
         return instrument

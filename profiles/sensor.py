@@ -356,15 +356,17 @@ class Sensor:
         effects: Mapping[str, Effect],
         mtf_along: float | None,
     ) -> Instrument:
+        alpha, beta = noise
         return Instrument(
-            mtf,
-            *noise,
-            self.gain_dn_per_radiance.low,
-            int(self.bits.low),
-            effects,
-            mtf_along,
-            self.radiance_1.low,
-            self.response,
+            mtf_nyquist=mtf,
+            alpha=alpha,
+            beta=beta,
+            gain_dn_per_radiance=self.gain_dn_per_radiance.low,
+            bits=int(self.bits.low),
+            effects=effects,
+            mtf_nyquist_along=mtf_along,
+            radiance_1=self.radiance_1.low,
+            response=self.response,
         )
 
 

@@ -164,7 +164,6 @@ class Decision:
     effect: str
     choice: Choice
     why: str
-    # None if the effect is applied without asking, or absent.
     bound_dn: float | None
     cost: str
 

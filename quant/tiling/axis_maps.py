@@ -126,7 +126,6 @@ class AxisNode:
             axes: axes of (N, C, H, W); a negative one counts from the last.
             otherwise: the value that is returned if no number is for this side.
         """
-        # A negative axis counts from the last one.
         by_axis = dict(zip((int(axis) % 4 for axis in axes), numbers, strict=True))
         return by_axis.get(2 + self.axis, otherwise)
 

@@ -228,9 +228,10 @@ def choose(candidates: Sequence[Measured], asked: Question) -> tuple[Measured, M
     if asked.need and not asked.budget:
         return candidates[0], best
     # They are sorted by cost: the first that is not significantly worse is the cheapest such.
-    return next(
+    choice = next(
         point for point in candidates if not significant(asked.compare.difference(best, point))
-    ), best
+    )
+    return choice, best
 
 
 def _violation(point: Measured, constraints: Sequence[Constraint]) -> float:
