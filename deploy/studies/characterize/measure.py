@@ -1,7 +1,7 @@
 """Measure noise and MTF of a sensor from its raw frames (`model.metrics.instrument`)."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -63,28 +63,7 @@ def measure_noise(frames: Frames) -> Noise:
         image_blocks(frames.tiles(path), frames.full_scale_dn, frames.black_dn)
         for path in frames.paths
     ]
-    # The difference of two frames that show the same scene, pixel by pixel, holds no texture
-    # (photon transfer).
-    # Two frames of a still scene have one level: sorted by it, they are neighbours.
-    by_level = sorted(frames.paths, key=lambda path: float(np.median(frames.read(path))))
-    differences = []
-    for one, other in pairwise(by_level):
-        first = frames.read(one)
-        second = frames.read(other)
-        level = float(np.median(first))
-        if (
-            first.shape != second.shape
-            or abs(float(np.median(second)) - level) > STILL_DRIFT * level
-        ):
-            continue
-        blocks = cut_pair(first, second, frames.full_scale_dn)
-        if not blocks.mean.size:
-            continue
-        # Structure that is left in the difference means that the scene or the camera moved.
-        structure = blocks.structure / np.maximum(blocks.fine, 1e-9)
-        if float(np.median(structure)) < STILL_STRUCTURE:
-            differences.append(blocks)
-    still = [above_black(blocks, frames.black_dn) for blocks in differences]
+    still = [above_black(blocks, frames.black_dn) for blocks in _still_pairs(frames)]
     model = fit_noise(join(still or frame_blocks), incomplete=True)
     if isinstance(model, Refusal):
         raise ImageError(
@@ -95,6 +74,29 @@ def measure_noise(frames: Frames) -> Noise:
     if not still and len(frame_blocks) > 1:
         _require_one_sensor(frames, frame_blocks, math.sqrt(math.prod(model.measured_dn)))
     return Noise(model, len(still))
+
+
+def _still_pairs(frames: Frames) -> Iterator[Blocks]:
+    """Yield the blocks of the difference of each two frames that show the same scene.
+
+    Pixel by pixel, such a difference holds no texture (photon transfer).
+    """
+    # Two frames of a still scene have one level: sorted by it, they are neighbours.
+    by_level = sorted(frames.paths, key=lambda path: float(np.median(frames.read(path))))
+    for one, other in pairwise(by_level):
+        first = frames.read(one)
+        second = frames.read(other)
+        level = float(np.median(first))
+        drift = abs(float(np.median(second)) - level)
+        if first.shape != second.shape or drift > STILL_DRIFT * level:
+            continue
+        blocks = cut_pair(first, second, frames.full_scale_dn)
+        if not blocks.mean.size:
+            continue
+        # Structure that is left in the difference means that the scene or the camera moved.
+        structure = blocks.structure / np.maximum(blocks.fine, 1e-9)
+        if float(np.median(structure)) < STILL_STRUCTURE:
+            yield blocks
 
 
 def _require_one_sensor(frames: Frames, frame_blocks: Sequence[Blocks], dn: float) -> None:

@@ -246,6 +246,29 @@ def _read_coco(labels: Path, folder: Path) -> tuple[list[_File], list[str]]:
     """Read the labels of every image that is both listed and in the folder. Also return a sentence
     about those that are not.
     """
+    files, listed = _coco_files(labels, folder)
+    if not files:
+        raise OptionError(
+            f"No image that {labels} lists ({listed}) is in {folder}. Give the folder that holds "
+            "them."
+        )
+    paths = {one.image for one in files}
+    if len(paths) < len(files):
+        raise OptionError(f"{labels} lists one image of {folder} twice. {CORRECT}")
+    # COCO's names may lead into folders below.
+    there = list(chain.from_iterable(map(list_images, {path.parent for path in paths})))
+    absent = listed - len(files)
+    unlisted = len([path for path in there if path not in paths])
+    remarks = {
+        f"{absent} of {listed} images in {labels.name} are not in the folder.": absent,
+        f"{unlisted} of {len(there)} images in the folder are left out, because {labels.name} does "
+        "not list them.": unlisted,
+    }
+    return files, [text for text, n in remarks.items() if n]
+
+
+def _coco_files(labels: Path, folder: Path) -> tuple[list[_File], int]:
+    """Read the labels of the listed images that are in the folder, and count those listed."""
     try:
         content: Any = read_json(labels)
         # `str.strip` raises TypeError where a name is no text, and the file is refused below.
@@ -271,31 +294,13 @@ def _read_coco(labels: Path, folder: Path) -> tuple[list[_File], list[str]]:
             for entry in content["images"]
             if (path := _inside(folder, entry["file_name"]))
         ]
+        return files, len(content["images"])
     except (OSError, LookupError, TypeError, ValueError, OverflowError) as error:
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:100]}"
         raise OptionError(
             f"{labels} must have COCO's lists of images, annotations and categories, but they "
             f"cannot be read ({reason}). Give COCO's JSON file."
         ) from error
-    listed = len(content["images"])
-    if not files:
-        raise OptionError(
-            f"No image that {labels} lists ({listed}) is in {folder}. Give the folder that holds "
-            "them."
-        )
-    paths = {one.image for one in files}
-    if len(paths) < len(files):
-        raise OptionError(f"{labels} lists one image of {folder} twice. {CORRECT}")
-    # COCO's names may lead into folders below.
-    there = list(chain.from_iterable(map(list_images, {path.parent for path in paths})))
-    absent = listed - len(files)
-    unlisted = len([path for path in there if path not in paths])
-    remarks = {
-        f"{absent} of {listed} images in {labels.name} are not in the folder.": absent,
-        f"{unlisted} of {len(there)} images in the folder are left out, because {labels.name} does "
-        "not list them.": unlisted,
-    }
-    return files, [text for text, n in remarks.items() if n]
 
 
 def _inside(folder: Path, name: str) -> Path | None:

@@ -106,7 +106,6 @@ class AcquiredScene:
         Returns:
             The image (h, w, 3), float32 in 0 to 1.
         """
-        # All rows of a scene share the stretch of the reference, so that contrast compares.
         dn = self.reference if method is None else method.restore(self.degraded)
         return stretch_of(self.reference).to_srgb(dn)
 
@@ -211,9 +210,20 @@ def run_study(
                     boxes[row].append(scene.boxes(detector, method))
                     bar.advance(1, row)
         hits = {row: find_hits(truths, row_boxes, len(names)) for row, row_boxes in boxes.items()}
-        scores = score_rows(hits, names, weights)
+        figures, confidence = score_rows(hits, names, weights)
         shown = list(acquired(scenes, pair, seed))
-        compared.append(Comparison(pair, rows, shown, boxes, hits, *scores, names))
+        compared.append(
+            Comparison(
+                sensors=pair,
+                methods=rows,
+                scenes=shown,
+                boxes=boxes,
+                hits=hits,
+                figures=figures,
+                confidence=confidence,
+                names=names,
+            )
+        )
     return compared
 
 
