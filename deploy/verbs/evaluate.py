@@ -3,7 +3,7 @@
 import logging
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -149,9 +149,9 @@ def evaluate(
     from beers_deploy.studies.evaluation.calibrate import calibrate_network, network_to_calibrate
     from beers_deploy.studies.evaluation.run import run_evaluation
 
-    stored, in_memory = _stored_or_given(pairs)
+    given = _folder_or_pairs(pairs)
     named = named_methods(methods)
-    sensors = _sensors(sensor, reference, stored, in_memory)
+    sensors = _sensors(sensor, reference, given)
     rates = list[float]()
     if bits_per_pixel is not None:
         refuse_with("`methods` degraded", bits_per_pixel=len(named) == 1)
@@ -163,8 +163,7 @@ def evaluate(
         methods=named,
         sensors=sensors,
         scenes=path_or_none(images),
-        folder=stored,
-        given=in_memory,
+        pairs=given,
         lpips=path_or_none(lpips),
         factors=list(factors),
         rates=rates,
@@ -216,34 +215,36 @@ def numbers_of(name: str, value: Factors, most: float, example: str) -> list[flo
     return numbers
 
 
-def _stored_or_given(pairs: "Pairs | None") -> "tuple[Path | None, Sequence[Pair] | None]":
-    """Return the folder of stored pairs, and pairs in memory: one of them is None, or both."""
+def _folder_or_pairs(pairs: "Pairs | None") -> "Path | list[Pair] | None":
+    """Return the folder of stored pairs, or the pairs in memory, if there are any."""
     from beers_deploy.pairs import Pair
 
     if pairs is None:
-        return None, None
+        return None
     if isinstance(pairs, str | os.PathLike):
-        return Path(pairs), None
+        return Path(pairs)
     several = list(pairs) if isinstance(pairs, Iterable) else [pairs]
     if not all(isinstance(pair, Pair) for pair in several):
         raise OptionError("`pairs` must be a folder, or a list of Pair as `simulate` returns them.")
-    return None, several
+    return several
 
 
 def _sensors(
     sensor: SensorLike | None,
     reference: SensorLike | None,
-    stored: Path | None,
-    pairs: "Sequence[Pair] | None",
+    pairs: "Path | list[Pair] | None",
 ) -> "tuple[Sensor, Sensor]":
     """Return the sensors of the degraded and of the reference images."""
     from beers_deploy.model.pairs_recipe import profiles_for, read_pairs_recipe
 
-    if pairs and sensor is None:
+    recipe = None
+    if isinstance(pairs, Path):
+        recipe = read_pairs_recipe(pairs)
+    elif pairs and sensor is None:
         # Simulated pairs know the sensors that made them.
         sensor, own = pairs[0].profiles
         reference = own if reference is None else reference
-    return profiles_for(sensor, reference, read_pairs_recipe(stored) if stored else None)
+    return profiles_for(sensor, reference, recipe)
 
 
 def _detection(

@@ -92,8 +92,7 @@ def run_evaluation(
     methods: Mapping[str, NetworkLike | Restore],
     sensors: tuple[Sensor, Sensor],
     scenes: Path | None,
-    folder: Path | None,
-    given: Sequence[Pair] | None,
+    pairs: Path | Sequence[Pair] | None,
     lpips: Path | None,
     factors: Sequence[float],
     rates: Sequence[float],
@@ -109,8 +108,7 @@ def run_evaluation(
             from degraded to restored digital numbers (H, W).
         sensors: the sensors of the degraded and of the reference images.
         scenes: the folder of scenes to simulate pairs from; None for drawn scenes.
-        folder: the folder of stored pairs; None if there are none.
-        given: the pairs in memory; None if there are none.
+        pairs: the folder of stored pairs, or pairs in memory; None to simulate them.
         lpips: the file or folder of weights for LPIPS; None for the path in the environment.
         factors: the factors by which the radiance of scenes is multiplied; the first is 1.
         rates: the bits per pixel to which images are compressed before or after restoration.
@@ -129,14 +127,13 @@ def run_evaluation(
     instruments = scores.Instruments(distances, nominal.max_dn, nominal.offset_dn)
     remarks = list[str]()
     sensor_rows = list[Row]()
-    loaded = list[NamedPair]()
-    if given is not None:
-        loaded = numbered_pairs(given)
-    elif folder is not None:
-        loaded = read_pairs(folder, nominal.max_dn, read_pairs_recipe(folder))
-        sensor_rows = [_sensor_row(loaded, sensors[0], str(folder), strict)]
-    else:
+    if pairs is None:
         loaded, remarks = pairs_of_scenes(scenes, *sensors, seed)
+    elif isinstance(pairs, Path):
+        loaded = read_pairs(pairs, nominal.max_dn, read_pairs_recipe(pairs))
+        sensor_rows = [_sensor_row(loaded, sensors[0], str(pairs), strict)]
+    else:
+        loaded = numbered_pairs(pairs)
     rows = _compared(compared, loaded, sensors, instruments, seed)
     for factor in factors[1:]:
         dimmed, _ = pairs_of_scenes(scenes, *sensors, seed, factor)
@@ -160,7 +157,7 @@ def run_evaluation(
             "methods": ",".join(methods),
             "brightness": ",".join(f"{factor:g}" for factor in factors),
         },
-        inputs=tuple(_inputs(methods, lpips, scenes, folder)),
+        inputs=tuple(_inputs(methods, lpips, scenes, pairs)),
         rows=every,
         notes=tuple(notes),
         headings=HEADINGS,
@@ -217,7 +214,7 @@ def _inputs(
     methods: Mapping[str, NetworkLike | Restore],
     lpips: Path | None,
     scenes: Path | None,
-    folder: Path | None,
+    pairs: Path | Sequence[Pair] | None,
 ) -> Iterator[Path | Input]:
     """Yield the inputs of the figures: networks, weights of LPIPS, scenes or pairs."""
     for source in methods.values():
@@ -231,8 +228,8 @@ def _inputs(
     if lpips is not None and lpips.is_file():
         yield lpips
     folders = [scenes] if scenes else []
-    if folder:
-        folders = [folder / "degraded", folder / "reference"]
+    if isinstance(pairs, Path):
+        folders = [pairs / "degraded", pairs / "reference"]
     yield from chain.from_iterable(map(list_images, folders))
 
 
