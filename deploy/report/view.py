@@ -207,11 +207,12 @@ def _map_layer(name: str, source: Source, raw: Raster) -> Layer:
         times = max(1, BLOCK_PX // (SHARP_PX * reduction(raw)))
         picture = np.zeros((*states.shape[1:], 4), np.uint8)
         # The worst state of all bands counts. A block that no band has a state for stays clear.
+        legend = (*STATES.values(), ("transparent", "too few pixels to check"))
         for state in (SMOOTH, WITHIN, OUTSIDE):
             colour = bytes.fromhex(STATES[state][0].removeprefix("#"))
             picture[(states == state).any(axis=0)] = (*colour, BLOCK_ALPHA)
         shown = picture.repeat(times, axis=0).repeat(times, axis=1)
-        return Layer(name, shown, BLOCK_PX / times, tuple(STATES.values()))
+        return Layer(name, shown, BLOCK_PX / times, legend)
     (plane,) = read_planes(source, range(1), reduction(raster))
     stretch = Stretch(0, float(np.percentile(_sample(plane), STRETCH[1])))
     shown = _stretched(plane[None], [stretch])
