@@ -213,9 +213,7 @@ def _drawn(recipe: DatasetRecipe, window: Window) -> tuple[dict[str, Any], dict[
 CHUNK = 32
 """The number of patches per call: small enough to lose little if the run is killed."""
 MOST_PROCESSES = 61 if sys.platform == "win32" else 1 << 16
-"""The maximum number of processes: Windows cannot wait for more, and Python refuses a larger pool
-there.
-"""
+"""The maximum number of processes: on Windows, Python refuses a larger pool."""
 
 
 def write_dataset(
@@ -252,7 +250,9 @@ def write_dataset(
         missing = [window for window in chunk if window.number not in lines]
         if missing:
             waiting[path] = missing
-    executor = _executor(pool, workers, len(waiting))
+    count = min(workers, len(waiting), MOST_PROCESSES)
+    executor: AbstractContextManager[Executor | None]
+    executor = nullcontext(pool) if pool or count < 2 else processes(count)
     with steps("simulating", len(windows)) as bar, executor as calls:
         bar.advance(len(lines))
         for path, patches in _patches_by_path(recipe, waiting, workers, calls):
@@ -271,15 +271,6 @@ def write_dataset(
         line = json.loads(text)
         rejected += sum(line[role]["rejected_snr_pairs"] for role in ROLES)
     return {"patches": len(lines), "rejected_share": rejected / (rejected + 2 * len(lines))}
-
-
-def _executor(
-    pool: Executor | None, workers: int, calls: int
-) -> AbstractContextManager[Executor | None]:
-    """Return the given pool, or new processes if there are several calls; None to call here."""
-    if pool is None and workers > 1 and calls > 1:
-        return processes(min(workers, MOST_PROCESSES))
-    return nullcontext(pool)
 
 
 @contextmanager

@@ -28,6 +28,11 @@ NUMBERS = {
 }
 DEAD = np.array([0.1, -9.0, 0.2, -9.0, 0.1])
 SAME = "Conv<pads=[1,1,1,1]>"
+SQUEEZED = """r = Relu(c)
+        mean = GlobalAveragePool(r)
+        g = Conv(mean, g_w, g_b)
+        gated = Mul(g, r)
+        out = Conv(gated, out_w, out_b)"""
 WHERE = 'coordinate_transformation_mode="asymmetric", nearest_mode="floor"'
 
 
@@ -213,13 +218,9 @@ VALID = {
         last=(1, 4, 3, 3),
     ),
     "squeezed behind a mirrored border": sketch(
-        """wide = Pad<mode="reflect">(in, around)
+        f"""wide = Pad<mode="reflect">(in, around)
         c = Conv(wide, c_w, c_b)
-        r = Relu(c)
-        mean = GlobalAveragePool(r)
-        g = Conv(mean, g_w, g_b)
-        gated = Mul(g, r)
-        out = Conv(gated, out_w, out_b)""",
+        {SQUEEZED}""",
         side=36,
         sizes={"out": 1.0},
         c=(5, 1, 3, 3),
@@ -228,11 +229,7 @@ VALID = {
     ),
     "squeezed": sketch(
         f"""c = {SAME}(in, c_w, c_b)
-        r = Relu(c)
-        mean = GlobalAveragePool(r)
-        g = Conv(mean, g_w, g_b)
-        gated = Mul(g, r)
-        out = Conv(gated, out_w, out_b)""",
+        {SQUEEZED}""",
         side=36,
         sizes={"g": 1.0, "out": 1.0},
         c=(4, 1, 3, 3),
