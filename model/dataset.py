@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from itertools import chain, groupby, product
 from pathlib import Path
@@ -251,7 +251,6 @@ def write_dataset(
         if missing:
             waiting[path] = missing
     count = min(workers, len(waiting), MOST_PROCESSES)
-    executor: AbstractContextManager[Executor | None]
     executor = nullcontext(pool) if pool or count < 2 else processes(count)
     with steps("simulating", len(windows)) as bar, executor as calls:
         bar.advance(len(lines))

@@ -390,11 +390,9 @@ def numbers_of(profile: Sensor) -> dict[str, object]:
     constants: dict[str, Constant | None] = {key: getattr(profile, key) for key in TABLE_OF}
     for effect, table in profile.effects.items():
         constants |= {f"{effect}.{key}": constant for key, constant in table.items()}
-    numbers: dict[str, object] = {
-        key: constant and (constant.low, constant.high) for key, constant in constants.items()
-    }
+    ends = {key: constant and (constant.low, constant.high) for key, constant in constants.items()}
     # The representation contains all samples. The text of a response only contains a digest.
-    return {**numbers, "response": repr(profile.response)}
+    return {**ends, "response": repr(profile.response)}
 
 
 SensorLike = Sensor | str | os.PathLike[str]
